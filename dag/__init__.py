@@ -1,0 +1,44 @@
+"""The component runtime: graph engine, processors, component kinds, module files, and the process that runs them."""
+
+from .backlog import BacklogConfig
+from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
+from .configuration import ConfigFile, find_config, import_class, nearest, parse_overrides
+from .engine import GraphEngine, Run, Vertex, VertexTiming
+from .graph import draw_mermaid, draw_text
+from .process import Process, load_module
+from .processor import In, Out, Processor, ProcessorConfig, ProcessorHarness
+from .schema import ComponentSpec, ModuleSpec, VertexSpec
+from .sync import CommitDagProcessor
+from .trigger import Trigger
+
+__all__ = [
+    "BacklogConfig",
+    "CommitDagProcessor",
+    "Component",
+    "ComponentSpec",
+    "ConfigFile",
+    "DagComponent",
+    "DataProcessComponent",
+    "GenericComponent",
+    "GraphEngine",
+    "In",
+    "ModuleSpec",
+    "MonotonicDagComponent",
+    "Out",
+    "Process",
+    "Processor",
+    "ProcessorConfig",
+    "ProcessorHarness",
+    "Run",
+    "Trigger",
+    "Vertex",
+    "VertexSpec",
+    "VertexTiming",
+    "draw_mermaid",
+    "draw_text",
+    "find_config",
+    "import_class",
+    "load_module",
+    "nearest",
+    "parse_overrides",
+]

@@ -27,7 +27,7 @@ def _initialise() -> None:
 
 
 def device_names() -> list[str]:
-    """The names of all devices of this machine: `cpu`, then `cuda:0`, `cuda:1` …"""
+    """The names of all devices of this machine: `cpu`, then `cuda:0`, and so on."""
     _initialise()
     return [str(device) for device in wp.get_devices()]
 

@@ -1,0 +1,234 @@
+"""Configuration files: YAML, validated by a pydantic model, with errors that say where and what to do."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from ..errors import ConfigError
+
+__all__ = ["ConfigFile", "find_config", "import_class", "nearest", "override", "parse_overrides"]
+
+M = TypeVar("M", bound=BaseModel)
+
+_ENVIRONMENT_PREFIX = "WARPLOOM__"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint for a message: the known name most like `name`, and all that are known."""
+    known = sorted(str(k) for k in known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return f"{hint}known: {', '.join(known) or 'none'}"
+
+
+def _unique_keys(node: yaml.Node | None, path: Path) -> None:
+    """Refuses a key that stands twice in one mapping, which YAML would resolve in silence."""
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            if key.value in seen:
+                raise ConfigError(f"{path}:{key.start_mark.line + 1}: key {key.value!r} stands twice in one mapping")
+            seen.add(key.value)
+            _unique_keys(value, path)
+    elif isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _unique_keys(item, path)
+
+
+class ConfigFile(Generic[M]):
+    """One configuration file: its model, and for messages the lines on which its keys stand."""
+
+    def __init__(
+        self, path: str | Path, model: type[M], changes: Mapping[tuple[str | int, ...], Any] | None = None
+    ) -> None:
+        """Reads and validates a file.
+
+        Args:
+            path: The YAML file.
+            model: What it must fit.
+            changes: Values that replace those of the file, by the path of their keys.
+
+        Raises:
+            ConfigError: It cannot be read, is not YAML, or does not fit the model; the message names the file, the
+                line, the key, what was expected and the nearest known key.
+        """
+        self.path = Path(path)
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"{self.path}: cannot be read: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{self.path}: is not UTF-8 text: {error}") from error
+        try:
+            self._root = yaml.compose(text, Loader=yaml.SafeLoader)
+            data = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            where = f":{mark.line + 1}" if mark is not None else ""
+            problem = getattr(error, "problem", None) or str(error)
+            raise ConfigError(f"{self.path}{where}: is not YAML: {problem}") from error
+        _unique_keys(self._root, self.path)
+        if not isinstance(data, dict):
+            raise ConfigError(f"{self.path}:1: expected a mapping of keys to values, found {type(data).__name__}")
+        for keys, value in (changes or {}).items():
+            override(data, keys, value)
+        try:
+            self.content: M = model.model_validate(data)
+        except ValidationError as error:
+            raise ConfigError("\n".join(self._explain(error, model))) from error
+
+    def line(self, keys: Sequence[str | int]) -> int:
+        """The line, from 1, on which a key stands; that of its nearest parent where it is not in the file."""
+        node, line = self._root, 1
+        for key in keys:
+            if isinstance(node, yaml.MappingNode):
+                pair = next(((k, v) for k, v in node.value if k.value == str(key)), None)
+                if pair is None:
+                    return line
+                line, node = pair[0].start_mark.line + 1, pair[1]
+            elif isinstance(node, yaml.SequenceNode) and isinstance(key, int) and key < len(node.value):
+                node = node.value[key]
+                line = node.start_mark.line + 1
+            else:
+                return line
+        return line
+
+    def error(self, keys: Sequence[str | int], message: str) -> ConfigError:
+        """An error about a key of this file."""
+        return ConfigError(f"{self.path}:{self.line(keys)}: {'.'.join(map(str, keys))}: {message}")
+
+    def validate(self, keys: Sequence[str | int], model: type[BaseModel], data: Mapping[str, Any]) -> BaseModel:
+        """Validates a part of this file, at `keys`, by a model of its own.
+
+        Raises:
+            ConfigError: It does not fit.
+        """
+        try:
+            return model.model_validate(dict(data))
+        except ValidationError as error:
+            raise ConfigError("\n".join(self._explain(error, model, keys))) from error
+
+    def _explain(self, error: ValidationError, model: type[BaseModel], prefix: Sequence[str | int] = ()) -> list[str]:
+        lines = []
+        for problem in error.errors():
+            keys = [*prefix, *(key for key in problem["loc"] if key != "[key]")]
+            where = f"{self.path}:{self.line(keys)}: {'.'.join(map(str, keys)) or 'file'}"
+            if problem["type"] == "extra_forbidden":
+                known = _known_keys(model, problem["loc"][:-1])
+                lines.append(f"{where}: unknown key; {nearest(str(keys[-1]), known)}")
+            elif problem["type"] == "missing":
+                lines.append(f"{where}: this key is missing")
+            else:
+                lines.append(f"{where}: {problem['msg']}, found {problem['input']!r}")
+        return lines
+
+
+def _known_keys(model: Any, keys: Sequence[str | int]) -> list[str]:
+    """The keys that a model takes at a place within it."""
+    for key in keys:
+        field = _fields(model).get(str(key))
+        model = field if field is not None else model
+    return list(_fields(model))
+
+
+def _fields(annotation: Any) -> dict[str, Any]:
+    """Key → type of the model found in an annotation, however deep in lists, dicts and unions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {field.alias or name: field.annotation for name, field in annotation.model_fields.items()}
+    fields: dict[str, Any] = {}
+    for argument in getattr(annotation, "__args__", ()):
+        fields.update(_fields(argument))
+    return fields
+
+
+def override(data: dict[str, Any], keys: Sequence[str | int], value: Any) -> None:
+    """Sets a value deep in mappings and lists, making the mappings on the way."""
+    place: Any = data
+    for key in keys[:-1]:
+        if isinstance(place, dict) and not isinstance(place.get(key), (dict, list)):
+            place[key] = {}
+        place = place[key]
+    place[keys[-1]] = value
+
+
+def parse_overrides(settings: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Dotted keys and their values, from `key=value` texts and the environment; the texts win.
+
+    Args:
+        settings: Such as `perception.cluster.radius=0.6`; the value is read as YAML.
+        environment: By default `os.environ`; `WARPLOOM__perception__cluster__radius` stands for the same key.
+
+    Raises:
+        ConfigError: A text has no `=`, or its value is not YAML.
+    """
+    environment = os.environ if environment is None else environment
+    texts = [
+        (name.removeprefix(_ENVIRONMENT_PREFIX).replace("__", "."), value)
+        for name, value in environment.items()
+        if name.startswith(_ENVIRONMENT_PREFIX)
+    ]
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set {text!r}: expected key=value, such as perception.cluster.radius=0.6")
+        texts.append((key.strip(), value))
+    overrides: dict[str, Any] = {}
+    for key, value in texts:
+        try:
+            overrides[key] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"setting {key}={value}: the value is not YAML: {error}") from error
+    return overrides
+
+
+def find_config(name: str, kind: str, shipped: Path) -> Path:
+    """Finds a configuration file by its name.
+
+    Args:
+        name: A path, or a name with or without `.yaml`.
+        kind: Its folder within a conf folder: `profiles`, `modules` …
+        shipped: The conf folder of the package, searched last, after `./conf` and `$WARPLOOM_CONF`.
+
+    Raises:
+        ConfigError: It is nowhere; the message lists the names that are.
+    """
+    direct = Path(name)
+    if direct.suffix in (".yaml", ".yml") and direct.is_file():
+        return direct
+    own = os.environ.get("WARPLOOM_CONF")
+    folders = [Path("conf"), *([Path(own)] if own else []), shipped]
+    file_name = name if direct.suffix in (".yaml", ".yml") else f"{name}.yaml"
+    for folder in folders:
+        candidate = folder / kind / file_name
+        if candidate.is_file():
+            return candidate
+    names = {path.stem for folder in folders for path in (folder / kind).glob("*.yaml")}
+    raise ConfigError(f"no {kind.removesuffix('s')} {name!r}: neither a file nor a name; {nearest(name, names)}")
+
+
+def import_class(dotted: str) -> type:
+    """The class of a dotted name, from warploom or from a package of the user's own.
+
+    Raises:
+        ConfigError: The module cannot be imported, or has no such class.
+    """
+    module_name, dot, class_name = dotted.rpartition(".")
+    if not dot:
+        raise ConfigError(f"{dotted!r} is not a dotted name: write package.module.Class")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(f"cannot import {module_name!r}: {error}; is its folder on PYTHONPATH?") from error
+    found = getattr(module, class_name, None)
+    if not isinstance(found, type):
+        classes = [name for name, value in vars(module).items() if isinstance(value, type)]
+        raise ConfigError(f"module {module_name!r} has no class {class_name!r}; {nearest(class_name, classes)}")
+    return found

@@ -1,0 +1,185 @@
+"""The graph of a component: built from its configuration, checked before anything runs, and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .configuration import ConfigFile, import_class, nearest
+from .engine import Vertex
+from .processor import In, Out, Processor
+from .schema import ComponentSpec, ModuleSpec
+
+__all__ = ["DeclaredVertex", "check_payloads", "declare_vertices", "draw_mermaid", "draw_text", "vertex_order"]
+
+
+@dataclass(frozen=True)
+class DeclaredVertex:
+    """A vertex as the configuration and its class declare it, not initialised."""
+
+    vertex: Vertex
+    config: Any
+    """An instance of the processor's `Config`."""
+
+
+def declare_vertices(
+    file: ConfigFile[ModuleSpec], keys: Sequence[str | int], component: ComponentSpec
+) -> list[DeclaredVertex]:
+    """The vertices of a component, in an order in which they can run.
+
+    Args:
+        file: The module file.
+        keys: Where the component stands in it.
+        component: Its specification.
+
+    Raises:
+        ConfigError: Unknown class, port or configuration key, missing or second producer, type mismatch, or cycle.
+    """
+    declared = {name: _declare(file, [*keys, "graph", name], name, component) for name in component.graph}
+    vertices = {name: one.vertex for name, one in declared.items()}
+    producers: dict[str, str] = dict.fromkeys(component.inputs, "")
+    for name, vertex in vertices.items():
+        for datum in vertex.outputs.values():
+            if datum in producers:
+                other = producers[datum]
+                first = f"vertex {other!r}" if other else "the component's input of that name"
+                raise file.error([*keys, "graph", name], f"datum {datum!r} has two producers: this and {first}")
+            producers[datum] = name
+    for name, vertex in vertices.items():
+        for port, datum in vertex.inputs.items():
+            if datum not in producers:
+                if vertex.processor.ports[port].optional:
+                    continue
+                raise file.error(
+                    [*keys, "graph", name, "in", port],
+                    f"nothing gives the datum {datum!r} for input {port!r}; {nearest(datum, producers)}",
+                )
+            if producers[datum]:
+                source = vertices[producers[datum]]
+                given = next(source.processor.ports[p].payload for p, d in source.outputs.items() if d == datum)
+                wanted = vertex.processor.ports[port].payload
+                if not check_payloads(given, wanted):
+                    raise file.error(
+                        [*keys, "graph", name, "in", port],
+                        f"{producers[datum]!r} gives {_type_name(given)} as {datum!r}, "
+                        f"but input {port!r} takes {_type_name(wanted)}",
+                    )
+    order = vertex_order(vertices.values(), component.inputs)
+    if len(order) < len(vertices):
+        stuck = [name for name in vertices if name not in order]
+        raise file.error([*keys, "graph", stuck[0]], f"these vertices wait for each other in a cycle: {stuck}")
+    return [declared[name] for name in order]
+
+
+def _declare(
+    file: ConfigFile[ModuleSpec], keys: Sequence[str | int], name: str, component: ComponentSpec
+) -> DeclaredVertex:
+    spec = component.graph[name]
+    try:
+        processor_class = import_class(spec.processor)
+    except Exception as error:
+        raise file.error([*keys, "processor"], str(error)) from error
+    if not issubclass(processor_class, Processor):
+        raise file.error(
+            [*keys, "processor"], f"{spec.processor} is not a Processor: derive it from warploom.dag.Processor"
+        )
+    config = file.validate([*keys, "config"], processor_class.Config, spec.config)
+    processor = processor_class()
+    processor.name = name
+    for direction, port_kind, mapping in (("in", In, spec.inputs), ("out", Out, spec.outputs)):
+        ports = [p for p, port in processor.ports.items() if isinstance(port, port_kind)]
+        for port in mapping:
+            if port not in ports:
+                raise file.error([*keys, direction, port], f"{spec.processor} has no such port; {nearest(port, ports)}")
+    inputs = {p: spec.inputs.get(p, p) for p, port in processor.ports.items() if isinstance(port, In)}
+    outputs = {p: spec.outputs.get(p, p) for p, port in processor.ports.items() if isinstance(port, Out)}
+    return DeclaredVertex(Vertex(name, processor, inputs, outputs), config)
+
+
+def vertex_order(vertices: Any, inputs: Mapping[str, str] | Sequence[str]) -> list[str]:
+    """Names of the vertices in an order in which they can run; those in a cycle are left out."""
+    vertices = list(vertices)
+    produced = {datum for vertex in vertices for datum in vertex.outputs.values()}
+    there = set(inputs)
+    order: list[str] = []
+    progress = True
+    while progress:
+        progress = False
+        for vertex in vertices:
+            needed = {datum for datum in vertex.inputs.values() if datum in produced or datum in there}
+            if vertex.name not in order and needed <= there:
+                order.append(vertex.name)
+                there.update(vertex.outputs.values())
+                progress = True
+    return order
+
+
+def check_payloads(given: Any, wanted: Any) -> bool:
+    """Whether a payload of type `given` may be read as `wanted`; what is not a class fits everything."""
+    if not isinstance(given, type) or not isinstance(wanted, type):
+        return True
+    return object in (given, wanted) or issubclass(given, wanted)
+
+
+def _type_name(payload: Any) -> str:
+    return payload.__name__ if isinstance(payload, type) else str(payload)
+
+
+def draw_text(module: ModuleSpec) -> str:
+    """The module's components and vertices as indented text: inputs → name → outputs."""
+    lines = [f"module {module.module}"]
+    for component in module.components:
+        inputs = ", ".join(component.inputs.values()) or "-"
+        outputs = ", ".join(component.outputs.values()) or "-"
+        lines.append(f"  {component.name} ({component.kind}): {inputs} -> {outputs}")
+        for name, inputs_of, outputs_of in _edges(component):
+            lines.append(f"    {', '.join(inputs_of) or '-'} -> [{name}] -> {', '.join(outputs_of) or '-'}")
+    return "\n".join(lines)
+
+
+def _edges(component: ComponentSpec) -> list[tuple[str, list[str], list[str]]]:
+    """Per vertex: its name, the data it reads, the data it gives."""
+    edges = []
+    for name, spec in component.graph.items():
+        ports = import_class(spec.processor)().ports
+        inputs = [spec.inputs.get(p, p) for p, port in ports.items() if isinstance(port, In)]
+        outputs = [spec.outputs.get(p, p) for p, port in ports.items() if isinstance(port, Out)]
+        edges.append((name, inputs, outputs))
+    return edges
+
+
+def draw_mermaid(module: ModuleSpec) -> str:
+    """The module as a Mermaid flow chart: a box per component, in it the vertices, arrows named by their data."""
+    lines = ["flowchart LR"]
+    topics: dict[str, None] = {}
+    links: list[str] = []
+    for component in module.components:
+        box = f"c_{component.name}"
+        topics.update(dict.fromkeys((*component.inputs.values(), *component.outputs.values())))
+        if not component.graph:
+            lines.append(f'  {box}["{component.name}"]')
+            links += [f"  {_topic(topic)} --> {box}" for topic in component.inputs.values()]
+            links += [f"  {box} --> {_topic(topic)}" for topic in component.outputs.values()]
+            continue
+        lines.append(f'  subgraph {box}["{component.name} ({component.kind})"]')
+        edges = _edges(component)
+        producers = {datum: name for name, _, given in edges for datum in given}
+        for name, _, _ in edges:
+            lines.append(f'    {box}_{name}["{name}"]')
+        lines.append("  end")
+        for name, read, _ in edges:
+            for datum in read:
+                if datum in producers:
+                    links.append(f"  {box}_{producers[datum]} -- {datum} --> {box}_{name}")
+                elif datum in component.inputs:
+                    links.append(f"  {_topic(component.inputs[datum])} --> {box}_{name}")
+            output = component.graph[name].config.get("output")
+            if output in component.outputs:
+                links.append(f"  {box}_{name} --> {_topic(component.outputs[output])}")
+    lines += [f'  {_topic(topic)}(["{topic}"])' for topic in topics]
+    return "\n".join(lines + links)
+
+
+def _topic(topic: str) -> str:
+    return "t_" + topic.replace("/", "_").replace("-", "_")

@@ -1,0 +1,247 @@
+"""A process: the components of several module files on one mesh, checked as a whole before anything starts."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..datamesh import DataMesh
+from ..errors import ConfigError
+from .backlog import BacklogConfig
+from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
+from .configuration import ConfigFile, import_class, nearest
+from .engine import VertexTiming
+from .graph import DeclaredVertex, check_payloads, declare_vertices
+from .schema import ComponentSpec, ModuleSpec
+
+__all__ = ["Process", "load_module", "module_changes"]
+
+_log = logging.getLogger(__name__)
+
+_Place = tuple[ConfigFile[ModuleSpec], int]
+
+
+def load_module(path: Path, changes: Mapping[tuple[str, ...], Any] | None = None) -> ConfigFile[ModuleSpec]:
+    """Reads and validates a module file.
+
+    Args:
+        path: The file.
+        changes: Settings by (component, …, key); those for components that are not in the file are left out.
+
+    Raises:
+        ConfigError: The file is bad.
+    """
+    file = ConfigFile(path, ModuleSpec)
+    placed = module_changes(file.content, changes or {})
+    return ConfigFile(path, ModuleSpec, placed) if placed else file
+
+
+def module_changes(module: ModuleSpec, changes: Mapping[tuple[str, ...], Any]) -> dict[tuple[str | int, ...], Any]:
+    """Settings by the user's keys, made into keys of the file.
+
+    `component.vertex.key` is a key of the vertex's configuration, `component.key` one of the component's configuration
+    or, where the component's schema has it (`workers`, `in_flight`, `backlog` …), of the component.
+    """
+    placed: dict[tuple[str | int, ...], Any] = {}
+    for keys, value in changes.items():
+        for index, component in enumerate(module.components):
+            if len(keys) < 2 or component.name != keys[0]:
+                continue
+            if keys[1] in component.graph and len(keys) > 2:
+                place: tuple[str, ...] = ("graph", keys[1], "config", *keys[2:])
+            elif keys[1] in ComponentSpec.model_fields:
+                place = keys[1:]
+            elif component.graph:
+                raise ConfigError(
+                    f"setting {'.'.join(keys)}: component {component.name!r} has no vertex {keys[1]!r}; "
+                    f"{nearest(keys[1], component.graph)}"
+                )
+            else:
+                place = ("config", *keys[1:])
+            placed["components", index, *place] = value
+    return placed
+
+
+class Process:
+    """Runs the components of some module files.
+
+    Building it validates everything: what is wrong raises ConfigError, and nothing has started.
+    """
+
+    def __init__(
+        self,
+        modules: Sequence[ConfigFile[ModuleSpec]],
+        *,
+        mesh: DataMesh | None = None,
+        context: Any = None,
+        external: Mapping[str, Any] | None = None,
+        offline: bool = False,
+        on_timing: Callable[[VertexTiming], None] | None = None,
+    ) -> None:
+        """Builds, checks and initialises all components.
+
+        Args:
+            modules: The module files.
+            mesh: Where their topics live; by default a mesh of its own.
+            context: Given to every component and processor as `self.context`.
+            external: Topics that are committed from outside the modules, with their payload types.
+            offline: Every backlog blocks its producer, so that no frame is lost to a slow component.
+            on_timing: Is told of the run of every vertex.
+
+        Raises:
+            ConfigError: A module does not fit its classes or the others.
+        """
+        self.mesh = mesh if mesh is not None else DataMesh()
+        self.components: dict[str, Component] = {}
+        self._started: list[Component] = []
+        places = [(file, index) for file in modules for index in range(len(file.content.components))]
+        built = [self._declare(place, context) for place in places]
+        self._check_topics(places, external or {})
+        for (file, index), (component, vertices) in zip(places, built, strict=True):
+            self._prepare(file, index, component, vertices, offline, on_timing)
+
+    def _declare(self, place: _Place, context: Any) -> tuple[Component, list[DeclaredVertex]]:
+        """Makes a component and its vertices, neither bound nor initialised."""
+        file, index = place
+        spec = file.content.components[index]
+        keys = ["components", index]
+        if spec.name in self.components:
+            raise file.error([*keys, "name"], f"there is a component {spec.name!r} already")
+        vertices: list[DeclaredVertex] = []
+        if spec.kind == "generic":
+            component = self._generic(place, spec, context)
+        else:
+            base = {"data": DataProcessComponent, "dag": DagComponent, "monotonic_dag": MonotonicDagComponent}[
+                spec.kind
+            ]
+            component = self._class_of(place, spec, base)(spec.name, context)
+        if isinstance(component, DagComponent):
+            component.add_handles(list(spec.inputs), list(spec.outputs))
+            vertices = declare_vertices(file, keys, spec)
+            for declared in vertices:
+                declared.vertex.processor.context = context
+                declared.vertex.processor.component_inputs = component.inputs
+                declared.vertex.processor.component_outputs = component.outputs
+        for direction, handles, topics in (
+            ("inputs", component.inputs, spec.inputs),
+            ("outputs", component.outputs, spec.outputs),
+        ):
+            for name in topics:
+                if name not in handles:
+                    raise file.error([*keys, direction, name], f"no such handle; {nearest(name, handles)}")
+            for name, handle in handles.items():
+                if name not in topics and not handle.optional:
+                    raise file.error(keys, f"{direction}.{name} is not mapped to a topic")
+        self.components[spec.name] = component
+        return component, vertices
+
+    @staticmethod
+    def _class_of(place: _Place, spec: ComponentSpec, base: type) -> type:
+        file, index = place
+        if not spec.class_name:
+            return base
+        try:
+            found = import_class(spec.class_name)
+        except ConfigError as error:
+            raise file.error(["components", index, "class"], str(error)) from error
+        if not issubclass(found, base):
+            raise file.error(["components", index, "class"], f"{spec.class_name} is not a {base.__name__}")
+        return found
+
+    def _generic(self, place: _Place, spec: ComponentSpec, context: Any) -> Component:
+        plain = self._class_of(place, spec, object)
+        if issubclass(plain, Component):
+            return plain(spec.name, context)
+        try:
+            return GenericComponent(spec.name, plain, spec.config, context)
+        except Exception as error:
+            keys = ["components", place[1], "config"]
+            raise place[0].error(keys, f"{spec.class_name} refused its configuration: {error}") from error
+
+    def _check_topics(self, places: Sequence[_Place], external: Mapping[str, Any]) -> None:
+        """Every topic that is read has exactly one producer, of a fitting type."""
+        producers: dict[str, str] = dict.fromkeys(external, "outside")
+        types: dict[str, Any] = dict(external)
+        for file, index in places:
+            spec = file.content.components[index]
+            for name, topic in spec.outputs.items():
+                if topic in producers:
+                    raise file.error(
+                        ["components", index, "outputs", name],
+                        f"topic {topic!r} has two producers: {producers[topic]!r} and {spec.name!r}",
+                    )
+                producers[topic] = spec.name
+                types[topic] = self.components[spec.name].outputs[name].payload
+        for file, index in places:
+            spec = file.content.components[index]
+            for name, topic in spec.inputs.items():
+                handle = self.components[spec.name].inputs[name]
+                keys = ["components", index, "inputs", name]
+                if topic not in producers and not handle.optional:
+                    raise file.error(keys, f"nobody produces topic {topic!r}; {nearest(topic, producers)}")
+                if not check_payloads(types.get(topic, object), handle.payload):
+                    raise file.error(keys, f"topic {topic!r} carries {types[topic]}, not {handle.payload}")
+
+    def _prepare(
+        self,
+        file: ConfigFile[ModuleSpec],
+        index: int,
+        component: Component,
+        vertices: Sequence[DeclaredVertex],
+        offline: bool,
+        on_timing: Callable[[VertexTiming], None] | None,
+    ) -> None:
+        """Binds a component to the mesh and initialises it."""
+        spec = file.content.components[index]
+        keys = ["components", index]
+        topics = {**spec.inputs, **spec.outputs}
+        unmapped = {
+            name: f"{spec.name}/{name}" for name in (*component.inputs, *component.outputs) if name not in topics
+        }
+        component.bind(self.mesh, {**topics, **unmapped})
+        for declared in vertices:
+            vertex = declared.vertex
+            try:
+                vertex.processor.init(declared.config)
+            except (ValueError, TypeError, KeyError) as error:
+                raise file.error([*keys, "graph", vertex.name, "config"], str(error)) from error
+        if isinstance(component, DagComponent):
+            component.set_graph(
+                [declared.vertex for declared in vertices],
+                workers=spec.workers,
+                in_flight=spec.in_flight,
+                on_timing=on_timing,
+            )
+        if not isinstance(component, GenericComponent):
+            component.init(file.validate([*keys, "config"], component.Config, spec.config))
+        if isinstance(component, DataProcessComponent):
+            backlog = BacklogConfig(policy="block", depth=spec.backlog.depth) if offline else spec.backlog
+            component.set_trigger(spec.trigger, backlog)
+
+    def start(self) -> None:
+        """Starts the components, those that consume before those that produce."""
+        for component in self._consumers_first():
+            component.start()
+            self._started.append(component)
+
+    def stop(self) -> None:
+        """Stops the components, those that produce first, each after it has finished what waits for it."""
+        while self._started:
+            self._started.pop().stop()
+
+    def _consumers_first(self) -> Iterable[Component]:
+        order: list[Component] = []
+        left = list(self.components.values())
+        while left:
+            for component in left:
+                topics = {handle.topic for handle in component.outputs.values()}
+                others = (other for other in left if other is not component)
+                if not any(topics & {handle.topic for handle in other.inputs.values()} for other in others):
+                    break
+            else:
+                component = left[0]  # a cycle through weak inputs: any order does
+            left.remove(component)
+            order.append(component)
+        return order

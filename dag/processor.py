@@ -1,0 +1,167 @@
+"""The processor: one vertex of a graph, one class, which can be imported and tested alone.
+
+class NearestObject(Processor):
+    objects: In[Obstacles]
+    distance: Out[float]
+
+    def process(self, trigger: Trigger) -> Status:
+        self.distance.value = float(np.linalg.norm(self.objects.value.boxes[:, :2], axis=1).min(initial=np.inf))
+        return Status.OK
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, ConfigDict
+
+from ..datamesh import Input, Output, Status
+from .trigger import Trigger
+
+__all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "declared_ports"]
+
+T = TypeVar("T")
+_ABSENT: Any = object()
+
+
+class _Port(Generic[T]):
+    """A port of a processor; the engine fills those for input before a run, and reads those for output after it."""
+
+    def __init__(self, *, optional: bool = False) -> None:
+        """Declares a port.
+
+        Args:
+            optional: The processor also runs in a frame in which this is absent.
+        """
+        self.optional = optional
+        self.name = ""
+        self.payload: Any = object
+        self._value: T = _ABSENT
+
+    @property
+    def present(self) -> bool:
+        """Whether it has a value in this run."""
+        return self._value is not _ABSENT
+
+    @property
+    def value(self) -> T:
+        """The value in this run.
+
+        Raises:
+            LookupError: It is absent.
+        """
+        if self._value is _ABSENT:
+            raise LookupError(f"{type(self).__name__} {self.name!r} has no value in this run")
+        return self._value
+
+    @value.setter
+    def value(self, value: T) -> None:
+        self._value = value
+
+    def clear(self) -> None:
+        """Makes it absent."""
+        self._value = _ABSENT
+
+
+class In(_Port[T]):
+    """What a processor reads."""
+
+
+class Out(_Port[T]):
+    """What a processor writes; not written in a run, it is absent for those after it."""
+
+
+class ProcessorConfig(BaseModel):
+    """The base of configurations: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def declared_ports(processor: type) -> dict[str, In | Out]:
+    """The ports that a class declares, by name, as new ports with their payload types.
+
+    A declaration is an annotation `name: In[Payload]`, with `= In(optional=True)` where options are wanted.
+    """
+    ports: dict[str, In | Out] = {}
+    for name, hint in get_type_hints(processor).items():
+        kind = get_origin(hint) or hint
+        if kind not in (In, Out):
+            continue
+        options = getattr(processor, name, None)
+        port = kind(optional=options.optional if isinstance(options, _Port) else False)
+        port.name = name
+        port.payload = (get_args(hint) or (object,))[0]
+        ports[name] = port
+    return ports
+
+
+class Processor:
+    """The base of all vertices. A processor serves one run at a time, and sees the frames in the order of versions."""
+
+    Config: ClassVar[type[BaseModel]] = ProcessorConfig
+    """The model of its configuration; a subclass names its own."""
+
+    def __init__(self) -> None:
+        self.name = type(self).__name__
+        self.context: Any = None
+        self.component_inputs: Mapping[str, Input] = {}
+        self.component_outputs: Mapping[str, Output] = {}
+        self.ports = declared_ports(type(self))
+        for name, port in self.ports.items():
+            setattr(self, name, port)
+
+    def init(self, config: Any) -> None:
+        """Prepares for the first run: builds plans, loads models. `config` is an instance of `Config`."""
+
+    def process(self, trigger: Trigger) -> Status:
+        """Runs for one frame: reads its In ports, writes its Out ports.
+
+        An exception fails this frame alone: it is counted, and the next frame runs.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Lets go of what `init` took."""
+
+
+class ProcessorHarness:
+    """Runs a processor alone, without graph or runtime.
+
+    outputs = ProcessorHarness(MyProcessor, {"radius": 0.5}).feed(cloud=cloud).run(version=0)
+    """
+
+    def __init__(self, processor: type[Processor], config: Mapping[str, Any] | None = None, context: Any = None):
+        """Makes and initialises the processor.
+
+        Args:
+            processor: Its class.
+            config: Its configuration, validated by the class's `Config`.
+            context: What the runtime would give as `self.context`.
+        """
+        self.processor = processor()
+        self.processor.context = context
+        self.processor.init(processor.Config.model_validate(dict(config or {})))
+        self.status: Status | None = None
+
+    def feed(self, **inputs: Any) -> Self:
+        """Sets In ports by name; they keep their values for the runs that follow.
+
+        Raises:
+            ValueError: There is no In port of that name.
+        """
+        for name, value in inputs.items():
+            port = self.processor.ports.get(name)
+            if not isinstance(port, In):
+                known = ", ".join(n for n, p in self.processor.ports.items() if isinstance(p, In))
+                raise ValueError(f"{type(self.processor).__name__} has no input {name!r}; it has: {known}")
+            port.value = value
+        return self
+
+    def run(self, version: int = 0) -> dict[str, Any]:
+        """Runs once and gives the Out ports that were written, by name; `.status` tells how it ended."""
+        outputs = {name: port for name, port in self.processor.ports.items() if isinstance(port, Out)}
+        for port in outputs.values():
+            port.clear()
+        self.status = self.processor.process(Trigger(version))
+        return {name: port.value for name, port in outputs.items() if port.present}

@@ -1,0 +1,27 @@
+"""How a commit or a run of a processor ended."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+__all__ = ["Status"]
+
+
+class Status(IntEnum):
+    """The outcome of a commit or of a run. Falsy on OK only, so `if status:` reads "if something is wrong"."""
+
+    OK = 0
+    MISS = 1
+    """An input was not there at the version wanted."""
+    OUT_OF_ORDER = 2
+    """Older than the newest in the window, so it was discarded."""
+    DUPLICATE = 3
+    """This version is in the window already, and stays."""
+    TIMEOUT = 4
+    """An input did not come before the deadline."""
+    SKIPPED = 5
+    """Not run, because an input that it needs is absent in this frame."""
+    FAILED = 6
+    """It raised an exception: the frame is lost, the next one runs."""
+    SHUTDOWN = 7
+    """The process is stopping."""
