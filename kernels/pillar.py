@@ -1,0 +1,290 @@
+"""The detection head's input: a grid of pillars seen from above, a few hand-made channels for each.
+
+A pillar is described by what transfers between sensors: which height slices hold points, where in the cell they
+lie and how high they reach. Intensity, the number of points and the position in the grid are left out on purpose.
+All sums are integers, so the bytes do not depend on the order of the points or of the threads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from .device import resolve_device
+from .interop import borrow_points, give
+from .plan import capacity_for, plan_for
+
+__all__ = ["PILLAR_SLICES", "SLICE_HEIGHT", "PillarGrid", "pillar_channels", "pillarize"]
+
+PILLAR_SLICES = 15
+"""Binary channels: below the ground, thirteen slices of `SLICE_HEIGHT` from the ground up, all above them."""
+
+SLICE_HEIGHT = 0.25
+"""Height of a slice [m]."""
+
+# A cell's sums are one row: (points, sum of z above the range [mm]) and (sums of dx, dy from the cell's corner
+# [1/4096 cell]), each pair packed in one number of 2 × 32 bits, then slice bits, the highest and lowest of these z.
+_POINTS_Z, _DX_DY, _BITS, _HIGH, _LOW, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 8))
+_HALF = wp.constant(wp.int64(32))
+_LOWER = wp.constant(wp.int64(0xFFFFFFFF))
+_FLOOR = wp.constant(wp.int64(-1))
+_CEILING = wp.constant(wp.int64(1_000_000))
+_SLICES = wp.constant(PILLAR_SLICES)
+_LAST_SLICE = wp.constant(PILLAR_SLICES - 1)
+
+
+def pillar_channels() -> tuple[str, ...]:
+    """The names of the channels in order: the slices, then means of dx, dy, z, then highest and lowest z."""
+    slices = [f"z{(i - 1) * SLICE_HEIGHT:.2f}" for i in range(1, PILLAR_SLICES)]
+    return ("below", *slices, "mean_dx", "mean_dy", "mean_z", "z_max", "z_min")
+
+
+@wp.kernel
+def _clear_pillars(
+    # in
+    cells_in: wp.array(dtype=wp.int32),
+    bits_in: wp.array(dtype=wp.int32),
+    cell_count_in: wp.array(dtype=wp.int32),
+    # in out
+    grid: wp.array3d(dtype=wp.float32),
+):
+    """Zeroes what the launch before wrote, and nothing else."""
+    i = wp.tid()
+    if i >= cell_count_in[0]:
+        return
+    cell = cells_in[i]
+    row = cell // grid.shape[2]
+    column = cell - row * grid.shape[2]
+    bits = bits_in[i]
+    for s in range(_SLICES):
+        if (bits >> s) & 1 != 0:
+            grid[s, row, column] = 0.0
+    for channel in range(_SLICES, _SLICES + 5):
+        grid[channel, row, column] = 0.0
+
+
+@wp.kernel
+def _sum_pillars(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    sensor_height_in: wp.array(dtype=wp.float32),
+    low: wp.vec3,
+    high: wp.vec3,
+    inverse_cell: float,
+    inverse_slice: float,
+    columns: int,
+    # in out
+    sums: wp.array2d(dtype=wp.int64),
+    # out
+    cells_out: wp.array(dtype=wp.int32),
+    cell_count_out: wp.array(dtype=wp.int32),
+):
+    """Adds each point to its cell; the first in a cell puts the cell on the list."""
+    i = wp.tid()
+    if i >= count_in[0]:
+        return
+    point = xyz_in[i]
+    x = point[0]
+    y = point[1]
+    z = point[2] + sensor_height_in[0]
+    # NaN fails every comparison, so it is outside too.
+    inside = x >= low[0] and x < high[0] and y >= low[1] and y < high[1] and z >= low[2] and z < high[2]
+    if not inside:
+        return
+    u = (x - low[0]) * inverse_cell
+    v = (y - low[1]) * inverse_cell
+    column = wp.min(int(u), columns - 1)
+    row = wp.min(int(v), sums.shape[0] // columns - 1)
+    cell = row * columns + column
+    above = wp.int64(int((z - low[2]) * 1000.0))
+    level = wp.where(z >= 0.0, wp.min(int(z * inverse_slice) + 1, _LAST_SLICE), 0)
+    if wp.atomic_add(sums, cell, _POINTS_Z, (wp.int64(1) << _HALF) + above) == wp.int64(0):
+        cells_out[wp.atomic_add(cell_count_out, 0, 1)] = cell
+    dx = wp.int64((u - float(column)) * 4096.0)
+    dy = wp.int64((v - float(row)) * 4096.0)
+    wp.atomic_add(sums, cell, _DX_DY, (dx << _HALF) + dy)
+    # These only ever grow, or fall: most points change nothing, and a plain read shows it.
+    bit = wp.int64(1 << level)
+    if (sums[cell, _BITS] & bit) == wp.int64(0):
+        wp.atomic_or(sums, cell, _BITS, bit)
+    if sums[cell, _HIGH] < above:
+        wp.atomic_max(sums, cell, _HIGH, above)
+    if sums[cell, _LOW] > above:
+        wp.atomic_min(sums, cell, _LOW, above)
+
+
+@wp.kernel
+def _write_pillars(
+    # in
+    cells_in: wp.array(dtype=wp.int32),
+    cell_count_in: wp.array(dtype=wp.int32),
+    lowest: float,
+    # in out
+    sums: wp.array2d(dtype=wp.int64),
+    grid: wp.array3d(dtype=wp.float32),
+    # out
+    bits_out: wp.array(dtype=wp.int32),
+):
+    """Writes the channels of each cell on the list, and frees its row of sums for the next launch."""
+    i = wp.tid()
+    if i >= cell_count_in[0]:
+        return
+    cell = cells_in[i]
+    row = cell // grid.shape[2]
+    column = cell - row * grid.shape[2]
+    bits = int(sums[cell, _BITS])
+    bits_out[i] = bits
+    for s in range(_SLICES):
+        if (bits >> s) & 1 != 0:
+            grid[s, row, column] = 1.0
+    offsets = sums[cell, _DX_DY]
+    points_z = sums[cell, _POINTS_Z]
+    share = 1.0 / float(points_z >> _HALF)
+    grid[_SLICES, row, column] = float(offsets >> _HALF) * share / 4096.0 - 0.5
+    grid[_SLICES + 1, row, column] = float(offsets & _LOWER) * share / 4096.0 - 0.5
+    grid[_SLICES + 2, row, column] = float(points_z & _LOWER) * share / 1000.0 + lowest
+    grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
+    grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
+    sums[cell, _POINTS_Z] = wp.int64(0)
+    sums[cell, _DX_DY] = wp.int64(0)
+    sums[cell, _BITS] = wp.int64(0)
+    sums[cell, _HIGH] = _FLOOR
+    sums[cell, _LOW] = _CEILING
+
+
+@dataclass(frozen=True, kw_only=True)
+class PillarGrid:
+    """A plan: the grid of one cloud of up to `capacity` points; only the cells that held points are cleared.
+
+    Attributes:
+        grid: The network's input, shape (1, C, H, W), float32: channels of `pillar_channels`, rows along y, columns
+            along x. Offsets in cells from the cell's centre, heights [m] above the ground.
+        cells: The cells that hold points, shape (capacity or H·W, the smaller), int32: row · W + column, no set order.
+        cell_count: How many they are, shape (1,), int32.
+    """
+
+    point_range: tuple[float, float, float, float, float, float] = (-60.0, -60.0, -2.0, 60.0, 60.0, 6.0)
+    """xmin ymin zmin xmax ymax zmax [m], upper bounds open; z is the height above the ground."""
+    cell: float = 0.25
+    """Edge of a cell [m]."""
+    capacity: int
+    """Points that one launch can take."""
+    device: str = "cpu"
+    """A Warp device, such as `cpu` or `cuda:0`."""
+
+    def __post_init__(self):
+        low, high = self.point_range[:3], self.point_range[3:]
+        if not self.cell > 0:
+            raise ValueError(f"cell must be > 0 m, not {self.cell}")
+        if len(self.point_range) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"point_range must be xmin ymin zmin xmax ymax zmax, not {self.point_range}")
+        if self.capacity < 1:
+            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if max(4096.0, (high[2] - low[2]) * 1000.0) * self.capacity >= 2**32:
+            raise ValueError(
+                f"capacity {self.capacity} with heights {low[2]} … {high[2]} m overflows a sum of millimetres; "
+                "narrow the z of point_range"
+            )
+        device = resolve_device(self.device)
+        columns, rows = (round((high[axis] - low[axis]) / self.cell) for axis in (0, 1))
+        cells = columns * rows
+
+        def buffer(name: str, array: wp.array) -> None:
+            object.__setattr__(self, name, array)
+
+        buffer("grid", wp.zeros((1, PILLAR_SLICES + 5, rows, columns), dtype=wp.float32, device=device))
+        buffer("_grid", self.grid[0])
+        buffer("_sums", wp.zeros((cells, int(_ROW)), dtype=wp.int64, device=device))
+        self._sums[:, int(_HIGH)].fill_(_FLOOR)
+        self._sums[:, int(_LOW)].fill_(_CEILING)
+        buffer("cells", wp.zeros(min(self.capacity, cells), dtype=wp.int32, device=device))
+        buffer("_bits", wp.zeros_like(self.cells))
+        buffer("cell_count", wp.zeros(1, dtype=wp.int32, device=device))
+        buffer("_height", wp.zeros(1, dtype=wp.float32, device=device))
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """The shape of `grid`: (1, C, H, W)."""
+        return self.grid.shape
+
+    def launch(self, xyz: wp.array, count: wp.array, sensor_height: float | wp.array) -> None:
+        """Fills `grid` from the first `count[0]` of the points; points outside the range or not finite are left out.
+
+        Args:
+            xyz: Positions in the sensor's frame [m], z up, shape (n,), n ≤ capacity, dtype vec3, possibly strided.
+            count: Number of points, shape (1,), int32, on the device.
+            sensor_height: Height of the sensor above the ground [m]: a number or a device array of one float32.
+        """
+        if xyz.shape[0] > self.capacity:
+            raise ValueError(f"xyz has {xyz.shape[0]} points, more than the plan's capacity of {self.capacity}")
+        height = sensor_height
+        if not isinstance(height, wp.array):
+            height = self._height
+            height.fill_(float(sensor_height))
+        listed = self.cells.shape[0]
+        device = self.cells.device
+        wp.launch(
+            _clear_pillars,
+            listed,
+            inputs=[self.cells, self._bits, self.cell_count],
+            outputs=[self._grid],
+            device=device,
+        )
+        self.cell_count.zero_()
+        wp.launch(
+            _sum_pillars,
+            xyz.shape[0],
+            inputs=[
+                xyz,
+                count,
+                height,
+                wp.vec3(*self.point_range[:3]),
+                wp.vec3(*self.point_range[3:]),
+                1.0 / self.cell,
+                1.0 / SLICE_HEIGHT,
+                self.grid.shape[3],
+            ],
+            outputs=[self._sums, self.cells, self.cell_count],
+            device=device,
+        )
+        wp.launch(
+            _write_pillars,
+            listed,
+            inputs=[self.cells, self.cell_count, self.point_range[2]],
+            outputs=[self._sums, self._grid, self._bits],
+            device=device,
+        )
+
+
+def pillarize(
+    points: Any,
+    *,
+    sensor_height: float,
+    point_range: tuple[float, float, float, float, float, float] = (-60.0, -60.0, -2.0, 60.0, 60.0, 6.0),
+    cell: float = 0.25,
+) -> Any:
+    """The pillar channels of a cloud.
+
+    Args:
+        points: Positions in the sensor's frame [m], shape (n, 3 or more), any array family.
+        sensor_height: Height of the sensor above the ground [m].
+        point_range: xmin ymin zmin xmax ymax zmax [m], upper bounds open; z is the height above the ground.
+        cell: Edge of a cell [m].
+
+    Returns:
+        Shape (C, H, W), float32, of the family of `points`: channels of `pillar_channels`, rows along y, columns
+        along x.
+    """
+    borrowed = borrow_points(points)
+    plan = plan_for(
+        PillarGrid,
+        point_range=tuple(float(v) for v in point_range),
+        cell=float(cell),
+        capacity=capacity_for(len(borrowed)),
+        device=borrowed.device,
+    )
+    plan.launch(borrowed.xyz, wp.array([len(borrowed)], dtype=wp.int32, device=borrowed.device), sensor_height)
+    return give(plan._grid, borrowed.family)
