@@ -4,7 +4,7 @@ A wrong argument to a function of the API raises Python's own ValueError or Type
 comes from outside the code: files, models, configuration, devices.
 """
 
-__all__ = ["ConfigError", "DeviceError", "ModelError", "SourceError", "WarploomError"]
+__all__ = ["ConfigError", "DeviceError", "ModelError", "SinkError", "SourceError", "WarploomError"]
 
 
 class WarploomError(Exception):
@@ -25,3 +25,7 @@ class ModelError(WarploomError):
 
 class SourceError(WarploomError):
     """A recording, scan or sensor stream that cannot be read."""
+
+
+class SinkError(WarploomError):
+    """A recording or other output that cannot be written."""

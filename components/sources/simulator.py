@@ -1,0 +1,66 @@
+"""The embedded simulator as a source: the same frames as from a sensor, with the truth beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..messages import SensorFrame, Truth
+from .source import Source
+
+if TYPE_CHECKING:
+    from ...models.simulator import SimulatedFrame
+
+__all__ = ["SimulatorSource"]
+
+_UNSCORED = ("vegetation",)
+
+
+class SimulatorSource(Source):
+    """A simulated drive; the same arguments give the same frames."""
+
+    def __init__(self, scenario: str = "street", *, device: str | None = None, **options):
+        """Builds the world.
+
+        Args:
+            scenario: Which one.
+            device: Where the rays are cast; None: the CPU.
+            options: Any of seed, duration [s], rate [Hz], lidar, mounting_height [m].
+
+        Raises:
+            ValueError: There is no such scenario or lidar, or a number makes no sense.
+        """
+        from ...models.simulator import Simulator  # its kernels are compiled only when it is used
+
+        self._simulator = Simulator(scenario=scenario, device=device or "cpu", **options)
+        said = "&".join(f"{key}={value}" for key, value in options.items())
+        super().__init__(f"sim:{scenario}" + (f"?{said}" if said else ""))
+
+    @property
+    def length(self) -> int:
+        """How many frames the drive has."""
+        return len(self._simulator)
+
+    def __iter__(self) -> Iterator[SensorFrame]:
+        return (self._sensor_frame(frame) for frame in self._simulator)
+
+    def _sensor_frame(self, frame: SimulatedFrame) -> SensorFrame:
+        return SensorFrame(
+            version=int(frame.version),
+            index=int(frame.index),
+            points=frame.points,
+            ring=frame.ring,
+            t=frame.t,
+            frame_id=self.frame_id,
+            pose=frame.pose,
+            truth=Truth(
+                boxes=np.asarray(frame.boxes, np.float32),
+                classes=np.asarray(frame.classes, np.int32),
+                ids=np.asarray(frame.ids, np.int64),
+                velocities=np.asarray(frame.velocities, np.float32),
+                points=np.asarray(frame.counts, np.int32),
+                ground=frame.ground,
+            ),
+        )
