@@ -7,6 +7,7 @@ new array of the caller's family on the caller's device.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 
-__all__ = ["Family", "Points", "borrow", "borrow_points", "family_of", "give"]
+__all__ = ["Family", "Points", "adopt", "borrow", "borrow_points", "count_on", "family_of", "give"]
 
 _FLOATS = (np.float16, np.float32, np.float64)
 
@@ -51,6 +52,24 @@ class Points:
     def device(self) -> str:
         """The Warp name of the device on which the points lie."""
         return self.family.device
+
+    @property
+    def extra(self) -> wp.array:
+        """The columns after the third, shape (n, C - 3), float32, possibly strided, possibly none."""
+        n, columns = self.table.shape
+        return wp.array(
+            ptr=self.table.ptr + 12 if n and columns > 3 else None,
+            dtype=wp.float32,
+            shape=(n, columns - 3),
+            strides=(self.table.strides[0], 4),
+            device=self.table.device,
+        )
+
+
+@lru_cache(maxsize=64)
+def count_on(count: int, device: str) -> wp.array:
+    """The number `count` on a device, shape (1,), int32, kept between calls: to be read only."""
+    return wp.array([count], dtype=wp.int32, device=device)
 
 
 def family_of(array: Any, name: str = "array") -> Family:
@@ -205,3 +224,14 @@ def give(array: wp.array, family: Family) -> Any:
     return family.namespace.from_dlpack(copy) if family.namespace is not None else copy
 
 
+def adopt(host: np.ndarray, family: Family) -> Any:
+    """A fresh NumPy array as an array of `family`, without a copy; for results that were made on the host."""
+    if family.name == "numpy":
+        return host
+    if family.name == "torch":
+        import torch
+
+        return torch.from_numpy(host)
+    if family.name == "warp" or family.namespace is None:
+        return wp.array(host, copy=False, device=DEFAULT_DEVICE)
+    return family.namespace.from_dlpack(host)

@@ -1,0 +1,599 @@
+"""Voxelization, hard and with fixed capacities: the first points of each voxel, as a network for point clouds wants them.
+
+First come, first served: voxels are numbered by the lowest index of a point in them, and keep their first points in
+the order of the input. A CPU does just that, in one pass over a dense grid, or a hash table where a grid would be too
+large. A GPU gets the same bytes from a stable sort by cell. Both clear only what the launch before has touched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import adopt, borrow_points, count_on, give
+from .plan import capacity_for, plan_for
+
+__all__ = ["Voxelize", "Voxels", "voxelize"]
+
+# Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
+
+_DENSE_CELLS = 1 << 22  # of 4 bytes: larger grids miss the cache more than a hash table does
+_DROPPED_POINTS, _DROPPED_VOXELS, _OUTSIDE = (wp.constant(i) for i in range(3))
+_SPREAD = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
+_OUT_OF_GRID = wp.constant(wp.int64(-1))
+
+
+@wp.struct
+class _Grid:
+    low: wp.vec3
+    high: wp.vec3
+    size: wp.vec3
+    cells: wp.vec3i  # along x y z
+    total: wp.int64
+
+
+@wp.func
+def _cell_of(point: wp.vec3, grid: _Grid) -> wp.int64:
+    """The row-major cell of a point, x fastest, or -1. Every comparison is false for a NaN."""
+    cell = _OUT_OF_GRID
+    if (
+        point[0] >= grid.low[0]
+        and point[1] >= grid.low[1]
+        and point[2] >= grid.low[2]
+        and point[0] < grid.high[0]
+        and point[1] < grid.high[1]
+        and point[2] < grid.high[2]
+    ):
+        x = int((point[0] - grid.low[0]) / grid.size[0])
+        y = int((point[1] - grid.low[1]) / grid.size[1])
+        z = int((point[2] - grid.low[2]) / grid.size[2])
+        if x < grid.cells[0] and y < grid.cells[1] and z < grid.cells[2]:
+            cell = (wp.int64(z) * wp.int64(grid.cells[1]) + wp.int64(y)) * wp.int64(grid.cells[0]) + wp.int64(x)
+    return cell
+
+
+@wp.func
+def _write_coords(cell: wp.int64, grid: _Grid, voxel: int, coords: wp.array2d(dtype=wp.int32)):
+    row = cell / wp.int64(grid.cells[0])
+    layer = row / wp.int64(grid.cells[1])
+    coords[voxel, 0] = int(layer)
+    coords[voxel, 1] = int(row - layer * wp.int64(grid.cells[1]))
+    coords[voxel, 2] = int(cell - row * wp.int64(grid.cells[0]))
+
+
+@wp.func
+def _write_features(
+    xyz: wp.array(dtype=wp.vec3),
+    extra: wp.array2d(dtype=wp.float32),
+    point: int,
+    place: int,
+    features: wp.array(dtype=wp.float32),
+):
+    """Copies a point's columns to a place, counted in points from the start of `features`."""
+    columns = extra.shape[1]
+    base = place * (columns + 3)
+    position = xyz[point]
+    features[base] = position[0]
+    features[base + 1] = position[1]
+    features[base + 2] = position[2]
+    for column in range(columns):
+        features[base + 3 + column] = extra[point, column]
+
+
+@wp.kernel
+def _assign_in_order(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    dense: int,
+    max_points: int,
+    max_voxels: int,
+    # in out: table of voxel numbers, -1 where free; what the launch before has put there
+    table: wp.array(dtype=wp.int32),
+    slot_of_voxel: wp.array(dtype=wp.int32),
+    cell_of_voxel: wp.array(dtype=wp.int64),
+    numbered: wp.array(dtype=wp.int32),
+    # out
+    place_out: wp.array(dtype=wp.int32),
+    coords_out: wp.array2d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+    voxel_count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """One thread, point after point: gives each its place among the features, or -1."""
+    for old in range(numbered[0]):
+        table[slot_of_voxel[old]] = -1
+    mask = table.shape[0] - 1
+    voxels = int(0)
+    crowded = int(0)
+    outside = int(0)
+    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
+        place = int(-1)
+        cell = _cell_of(xyz_in[i], grid)
+        if cell < wp.int64(0):
+            outside += 1
+        else:
+            slot = int(cell)
+            if dense == 0:
+                slot = int((wp.uint64(cell) * _SPREAD) >> wp.uint64(34)) & mask
+            voxel = table[slot]
+            if dense == 0:
+                while voxel >= 0 and cell_of_voxel[voxel] != cell:
+                    slot = (slot + 1) & mask
+                    voxel = table[slot]
+            if voxel < 0:
+                voxel = voxels
+                voxels += 1
+                table[slot] = voxel
+                slot_of_voxel[voxel] = slot
+                cell_of_voxel[voxel] = cell
+                if voxel < max_voxels:
+                    counts_out[voxel] = 0
+                    _write_coords(cell, grid, voxel, coords_out)
+            if voxel < max_voxels:
+                rank = counts_out[voxel]
+                if rank < max_points:
+                    place = voxel * max_points + rank
+                    counts_out[voxel] = rank + 1
+                else:
+                    crowded += 1
+        place_out[i] = place
+    numbered[0] = voxels
+    voxel_count_out[0] = wp.min(voxels, max_voxels)
+    dropped_out[_DROPPED_POINTS] = crowded
+    dropped_out[_DROPPED_VOXELS] = wp.max(voxels - max_voxels, 0)
+    dropped_out[_OUTSIDE] = outside
+
+
+@wp.kernel
+def _clear_in_order(
+    # in
+    filled_in: wp.array(dtype=wp.int32),
+    counts_in: wp.array(dtype=wp.int32),
+    per_voxel: int,
+    columns: int,
+    # out
+    features_out: wp.array(dtype=wp.float32),
+):
+    """One thread: zeroes the features that the launch before has set."""
+    for voxel in range(filled_in[0]):
+        base = voxel * per_voxel
+        for k in range(counts_in[voxel] * columns):
+            features_out[base + k] = 0.0
+
+
+@wp.kernel
+def _fill(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    extra_in: wp.array2d(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    place_in: wp.array(dtype=wp.int32),
+    voxel_count_in: wp.array(dtype=wp.int32),
+    # out
+    features_out: wp.array(dtype=wp.float32),
+    filled_out: wp.array(dtype=wp.int32),
+):
+    """Copies each point to its place."""
+    i = wp.tid()
+    if i == 0:
+        filled_out[0] = voxel_count_in[0]
+    if i >= count_in[0]:
+        return
+    place = place_in[i]
+    if place >= 0:
+        _write_features(xyz_in, extra_in, i, place, features_out)
+
+
+@wp.kernel
+def _sort_keys(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    # out
+    key_out: wp.array(dtype=wp.int64),
+    point_out: wp.array(dtype=wp.int32),
+    first_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """The cell of each point; points without one get the number after the last, and sort to the end."""
+    i = wp.tid()
+    key = grid.total
+    if i < count_in[0]:
+        cell = _cell_of(xyz_in[i], grid)
+        if cell >= wp.int64(0):
+            key = cell
+        else:
+            wp.atomic_add(dropped_out, _OUTSIDE, 1)
+    key_out[i] = key
+    point_out[i] = i
+    first_out[i] = 0
+
+
+@wp.kernel
+def _mark_heads(
+    # in
+    key_in: wp.array(dtype=wp.int64),
+    point_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    # out
+    head_out: wp.array(dtype=wp.int32),
+    first_out: wp.array(dtype=wp.int32),
+):
+    """Marks where a cell begins among the sorted points, and the lowest point of each cell among all points."""
+    j = wp.tid()
+    head = int(0)
+    key = key_in[j]
+    if key < grid.total:
+        if j == 0:
+            head = 1
+        elif key_in[j - 1] != key:
+            head = 1
+    head_out[j] = head
+    if head == 1:
+        first_out[point_in[j]] = 1
+
+
+@wp.kernel
+def _mark_starts(
+    # in
+    head_in: wp.array(dtype=wp.int32),
+    segment_in: wp.array(dtype=wp.int32),
+    # out
+    start_out: wp.array(dtype=wp.int32),
+):
+    j = wp.tid()
+    if head_in[j] == 1:
+        start_out[segment_in[j] - 1] = j
+
+
+@wp.kernel
+def _fill_sorted(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    extra_in: wp.array2d(dtype=wp.float32),
+    grid: _Grid,
+    max_points: int,
+    max_voxels: int,
+    key_in: wp.array(dtype=wp.int64),
+    point_in: wp.array(dtype=wp.int32),
+    segment_in: wp.array(dtype=wp.int32),
+    start_in: wp.array(dtype=wp.int32),
+    number_in: wp.array(dtype=wp.int32),
+    # out
+    features_out: wp.array(dtype=wp.float32),
+    coords_out: wp.array2d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+    voxel_count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """Copies each sorted point to its place: its rank in the cell, in the voxel that the cell's first point numbers."""
+    j = wp.tid()
+    last = xyz_in.shape[0] - 1
+    if j == last:
+        voxels = number_in[last]
+        voxel_count_out[0] = wp.min(voxels, max_voxels)
+        dropped_out[_DROPPED_VOXELS] = wp.max(voxels - max_voxels, 0)
+    key = key_in[j]
+    if key == grid.total:
+        return
+    start = start_in[segment_in[j] - 1]
+    voxel = number_in[point_in[start]] - 1
+    if voxel >= max_voxels:
+        return
+    rank = j - start
+    if rank < max_points:
+        _write_features(xyz_in, extra_in, point_in[j], voxel * max_points + rank, features_out)
+    else:
+        wp.atomic_add(dropped_out, _DROPPED_POINTS, 1)
+    if rank == 0:
+        _write_coords(key, grid, voxel, coords_out)
+    ends = j == last
+    if not ends:
+        ends = key_in[j + 1] != key
+    if ends:
+        counts_out[voxel] = wp.min(rank + 1, max_points)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Voxelize:
+    """A plan: workspace to voxelize clouds of up to `capacity` points, of which it keeps `features` and the rest."""
+
+    voxel_size: tuple[float, float, float]
+    """Edges of a voxel along x y z [m], > 0."""
+    point_range: tuple[float, float, float, float, float, float]
+    """xmin ymin zmin xmax ymax zmax [m], upper bounds open."""
+    columns: int = 4
+    """Columns of a point, ≥ 3: x y z and what else it carries."""
+    max_points: int = 32
+    """Points that a voxel keeps."""
+    max_voxels: int = 40_000
+    """Voxels that are kept."""
+    capacity: int
+    """Points that one launch can take."""
+    device: str = DEFAULT_DEVICE
+    """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`in_order` (one thread), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. The results are equal."""
+
+    features: wp.array = field(init=False, repr=False, compare=False)
+    """Out: shape (max_voxels, max_points, columns), float32; zero where a voxel has no point."""
+    coords: wp.array = field(init=False, repr=False, compare=False)
+    """Out: shape (max_voxels, 3), int32, cell indices z y x."""
+    counts: wp.array = field(init=False, repr=False, compare=False)
+    """Out: shape (max_voxels,), int32, points kept in each voxel."""
+    voxel_count: wp.array = field(init=False, repr=False, compare=False)
+    """Out: shape (1,), int32, how many voxels there are; rows from there on are old or zero."""
+    dropped: wp.array = field(init=False, repr=False, compare=False)
+    """Out: shape (3,), int32: points beyond max_points, voxels beyond max_voxels, points outside or not finite."""
+
+    def __post_init__(self):
+        """Checks the numbers and makes the workspace."""
+        grid = _grid(self.voxel_size, self.point_range)
+        for name, least in (("columns", 3), ("max_points", 1), ("max_voxels", 1), ("capacity", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        size = self.max_voxels * self.max_points * self.columns
+        if size >= 1 << 31:
+            raise ValueError(
+                f"max_voxels × max_points × columns must stay below 2³¹ numbers, not {size}; lower max_voxels"
+            )
+        if self.method not in ("auto", "in_order", "sort"):
+            raise ValueError(f"method must be 'auto', 'in_order' or 'sort', not {self.method!r}")
+        device = resolve_device(self.device)
+        sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
+
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
+            keep(name, wp.empty(shape, dtype=dtype, device=device))
+
+        keep("_grid", grid)
+        keep("_sequential", sequential)
+        buffer("_features", size, wp.float32)
+        keep("features", self._features.reshape((self.max_voxels, self.max_points, self.columns)))
+        buffer("coords", (self.max_voxels, 3), wp.int32)
+        # As if a launch had filled every voxel, so that the first launch clears all of `features`.
+        keep("counts", wp.full(self.max_voxels, self.max_points, dtype=wp.int32, device=device))
+        keep("_filled", wp.full(1, self.max_voxels, dtype=wp.int32, device=device))
+        keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
+        keep("dropped", wp.zeros(3, dtype=wp.int32, device=device))
+        if sequential:
+            dense = grid.total <= _DENSE_CELLS
+            slots = int(grid.total) if dense else 2 << (self.capacity - 1).bit_length()
+            keep("_dense", int(dense))
+            keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
+            buffer("_slot_of_voxel", self.capacity, wp.int32)
+            buffer("_cell_of_voxel", self.capacity, wp.int64)
+            keep("_numbered", wp.zeros(1, dtype=wp.int32, device=device))
+            buffer("_place", self.capacity, wp.int32)
+        else:
+            keep("_bits", int(grid.total).bit_length())
+            buffer("_key", 2 * self.capacity, wp.int64)
+            buffer("_point", 2 * self.capacity, wp.int32)
+            for name in ("_first", "_number", "_head", "_segment", "_start"):
+                buffer(name, self.capacity, wp.int32)
+
+
+    def launch(self, xyz: wp.array, count: wp.array, extra: wp.array | None = None) -> None:
+        """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
+
+        Args:
+            xyz: Positions [m], shape (n,), vec3, n ≤ capacity.
+            count: Shape (1,), int32.
+            extra: The columns after the third, float32, shape (n, columns - 3), or (n,) where it is one column.
+        """
+        extra = self._checked(xyz, extra)
+        if not self._sequential:
+            self._launch_sort(xyz, count, extra)
+            return
+        wp.launch(
+            _clear_in_order,
+            1,
+            inputs=[self._filled, self.counts, self.max_points * self.columns, self.columns],
+            outputs=[self._features],
+            device=self.device,
+        )
+        self._assign(xyz, count)
+        self._fill_into(self._features, xyz, count, extra)
+
+    def _checked(self, xyz: wp.array, extra: wp.array | None) -> wp.array:
+        """`extra` with two dimensions, after a look at the shapes."""
+        n = xyz.shape[0]
+        if n > self.capacity:
+            raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
+        if extra is None:
+            extra = wp.array(ptr=None, dtype=wp.float32, shape=(n, 0), device=self.device)
+        elif extra.ndim == 1:
+            extra = wp.array(
+                ptr=extra.ptr, dtype=wp.float32, shape=(n, 1), strides=(extra.strides[0], 4), device=extra.device
+            )
+        if extra.shape != (n, self.columns - 3):
+            raise ValueError(f"extra must have shape ({n}, {self.columns - 3}), not {extra.shape}")
+        return extra
+
+    def _assign(self, xyz: wp.array, count: wp.array) -> None:
+        """In order: all outputs but the features, and each point's place among them."""
+        wp.launch(
+            _assign_in_order,
+            1,
+            inputs=[xyz, count, self._grid, self._dense, self.max_points, self.max_voxels],
+            outputs=[
+                self._table,
+                self._slot_of_voxel,
+                self._cell_of_voxel,
+                self._numbered,
+                self._place,
+                self.coords,
+                self.counts,
+                self.voxel_count,
+                self.dropped,
+            ],
+            device=self.device,
+        )
+
+    def _fill_into(self, features: wp.array, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
+        """In order: copies the points to their places in `features`, flat and zero before."""
+        wp.launch(
+            _fill,
+            max(xyz.shape[0], 1),
+            inputs=[xyz, extra, count, self._place, self.voxel_count],
+            outputs=[features, self._filled],
+            device=self.device,
+        )
+
+    def _launch_sort(self, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
+        n = xyz.shape[0]
+        self._features.zero_()
+        self.dropped.zero_()
+        if n == 0:
+            self.voxel_count.zero_()
+            return
+        first, number, head = self._first[:n], self._number[:n], self._head[:n]
+        segment = self._segment[:n]
+
+        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+            wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=self.device)
+
+        run(_sort_keys, [xyz, count, self._grid], [self._key, self._point, first, self.dropped])
+        wp.utils.radix_sort_pairs(self._key, self._point, n, end_bit=self._bits)
+        run(_mark_heads, [self._key, self._point, self._grid], [head, first])
+        wp.utils.array_scan(head, segment, inclusive=True)
+        wp.utils.array_scan(first, number, inclusive=True)
+        run(_mark_starts, [head, segment], [self._start])
+        run(
+            _fill_sorted,
+            [
+                *(xyz, extra, self._grid, self.max_points, self.max_voxels),
+                *(self._key, self._point, segment, self._start, number),
+            ],
+            [self._features, self.coords, self.counts, self.voxel_count, self.dropped],
+        )
+
+
+def _grid(voxel_size: Sequence[float], point_range: Sequence[float]) -> _Grid:
+    """The cells that `point_range` is cut into.
+
+    Raises:
+        ValueError: An edge that is not positive, a range that is empty or not finite, or far too many cells.
+    """
+    low, high = point_range[:3], point_range[3:]
+    cells = []
+    for axis, size, start, stop in zip("xyz", voxel_size, low, high, strict=True):
+        if not (size > 0 and math.isfinite(size)):
+            raise ValueError(f"voxel_size must be > 0 m and finite, not {size} along {axis}")
+        if not (start < stop and math.isfinite(start) and math.isfinite(stop)):
+            raise ValueError(
+                f"point_range must be xmin ymin zmin xmax ymax zmax with min < max, not {start} … {stop} along {axis}"
+            )
+        ratio = (stop - start) / size
+        # A range that is a whole number of voxels, but for the rounding of its decimals, has just that number.
+        whole = round(ratio)
+        cells.append(whole if whole > 0 and abs(ratio - whole) < 1e-3 else math.ceil(ratio))
+        if cells[-1] > 1 << 20:
+            raise ValueError(
+                f"point_range has {cells[-1]} voxels along {axis}, more than 2²⁰; choose a larger voxel_size"
+            )
+    grid = _Grid()
+    grid.low, grid.high, grid.size = wp.vec3(*low), wp.vec3(*high), wp.vec3(*voxel_size)
+    grid.cells = wp.vec3i(*cells)
+    grid.total = math.prod(cells)
+    return grid
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """The occupied voxels, in order of the lowest index of a point in them; arrays of the input's family."""
+
+    features: Any
+    """The columns of the points, shape (V, max_points, C), float32, in the order of the input, then zeros."""
+    coords: Any
+    """Cell indices z y x, shape (V, 3), int32."""
+    counts: Any
+    """Points kept in each voxel, shape (V,), int32."""
+    dropped_points: int
+    """Points left out since their voxel already had `max_points`."""
+    dropped_voxels: int
+    """Voxels left out, with all their points, since there were already `max_voxels`."""
+    outside: int
+    """Points left out since they are not finite or not in `point_range`."""
+
+    def __len__(self) -> int:
+        return self.counts.shape[0]
+
+
+def voxelize(
+    points: Any,
+    voxel_size: float | Sequence[float],
+    point_range: Sequence[float],
+    max_points: int = 32,
+    max_voxels: int = 40_000,
+) -> Voxels:
+    """Sorts points into voxels, or pillars where a voxel is as high as the range; first come, first served.
+
+    A point's cell is floor((position - minimum) / size) in float32, as in SECOND's and spconv's voxelizers, whose
+    results these are, to the bit, as long as the range is a whole number of voxels; else the last voxel is cut short.
+
+    Args:
+        points: Positions [m] and other columns, shape (n, C), C ≥ 3, floating; NumPy, torch, Warp or DLPack.
+        voxel_size: Edge of a voxel [m], one for all axes or three along x y z.
+        point_range: xmin ymin zmin xmax ymax zmax [m]; upper bounds open.
+        max_points: Points that a voxel keeps; later ones are dropped and counted.
+        max_voxels: Voxels kept; later ones are dropped with their points and counted.
+
+    Returns:
+        Features, coordinates and counts of the occupied voxels, on the device of `points`.
+
+    Raises:
+        TypeError: `points` is not a floating array.
+        ValueError: A shape or a number does not fit; the message says which.
+    """
+    borrowed = borrow_points(points)
+    size = tuple(float(edge) for edge in np.broadcast_to(np.asarray(voxel_size, np.float64), (3,)))
+    limits = tuple(float(limit) for limit in point_range)
+    if len(limits) != 6:
+        raise ValueError(f"point_range must have six numbers, xmin ymin zmin xmax ymax zmax, not {len(limits)}")
+    n, columns = borrowed.table.shape
+    plan = plan_for(
+        Voxelize,
+        voxel_size=size,
+        point_range=limits,
+        columns=columns,
+        max_points=int(max_points),
+        max_voxels=int(max_voxels),
+        capacity=capacity_for(n),
+        device=borrowed.device,
+    )
+    count = count_on(n, borrowed.device)
+    if borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, count, borrowed.extra)
+        voxels = int(plan.voxel_count.numpy()[0])
+        features = give(plan.features[:voxels], borrowed.family)
+    else:
+        # The features go straight to an array of their own: they are too many to be worth a second copy.
+        extra = plan._checked(borrowed.xyz, borrowed.extra)
+        plan._assign(borrowed.xyz, count)
+        voxels = int(plan.voxel_count.numpy()[0])
+        host = np.zeros((voxels, plan.max_points, columns), np.float32)
+        if voxels:
+            plan._fill_into(wp.array(host.reshape(-1), copy=False, device="cpu"), borrowed.xyz, count, extra)
+        features = adopt(host, borrowed.family)
+    dropped_points, dropped_voxels, outside = (int(number) for number in plan.dropped.numpy())
+    return Voxels(
+        features,
+        give(plan.coords[:voxels], borrowed.family),
+        give(plan.counts[:voxels], borrowed.family),
+        dropped_points,
+        dropped_voxels,
+        outside,
+    )
