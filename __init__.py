@@ -1,1 +1,98 @@
-"""warploom."""
+"""warploom: perception for vehicles and robots, from raw LiDAR points to tracked objects.
+
+import warploom as wl
+
+labels = wl.cluster(points, radius=0.5, min_size=10)
+with wl.Pipeline.from_profile("cpu") as pipeline:
+    for frame in pipeline.run(wl.read("scans/")):
+        print(len(frame.objects), frame.latency.total_ms)
+
+Names are loaded when they are first used, so that importing the package is quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .components.pipeline import Latency, PerceptionFrame, Pipeline
+    from .components.sources import open_source, read
+    from .errors import ConfigError, DeviceError, ModelError, SourceError, WarploomError
+    from .kernels.bev import BevMaps, bev
+    from .kernels.boxes import FitBoxes, fit_boxes
+    from .kernels.cloud import Cloud
+    from .kernels.cluster import EuclideanCluster, cluster
+    from .kernels.downsample import VoxelDownsample, voxel_downsample
+    from .kernels.filters import Filtered, PointFilter, filter_points
+    from .kernels.ground import Ground, GroundSegment, segment_ground
+    from .kernels.voxel import Voxelize, Voxels, voxelize
+    from .models.head import DetectionHead
+    from .models.tracker import Tracker, TrackerConfig, Tracks
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "components.pipeline": ("Latency", "PerceptionFrame", "Pipeline"),
+    "components.sources": ("open_source", "read"),
+    "errors": ("ConfigError", "DeviceError", "ModelError", "SourceError", "WarploomError"),
+    "kernels.bev": ("BevMaps", "bev"),
+    "kernels.boxes": ("FitBoxes", "fit_boxes"),
+    "kernels.cloud": ("Cloud",),
+    "kernels.cluster": ("EuclideanCluster", "cluster"),
+    "kernels.downsample": ("VoxelDownsample", "voxel_downsample"),
+    "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
+    "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
+    "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
+    "models.head": ("DetectionHead",),
+    "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "BevMaps",
+    "Cloud",
+    "ConfigError",
+    "DetectionHead",
+    "DeviceError",
+    "EuclideanCluster",
+    "Filtered",
+    "FitBoxes",
+    "Ground",
+    "GroundSegment",
+    "Latency",
+    "ModelError",
+    "PerceptionFrame",
+    "Pipeline",
+    "PointFilter",
+    "SourceError",
+    "Tracker",
+    "TrackerConfig",
+    "Tracks",
+    "VoxelDownsample",
+    "Voxelize",
+    "Voxels",
+    "WarploomError",
+    "bev",
+    "cluster",
+    "filter_points",
+    "fit_boxes",
+    "open_source",
+    "read",
+    "segment_ground",
+    "voxel_downsample",
+    "voxelize",
+]
+
+
+def __getattr__(name: str) -> object:
+    home = _HOME_OF.get(name)
+    if home is None:
+        raise AttributeError(f"module 'warploom' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{home}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME_OF])

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Obstacles", "SensorFrame", "Truth"]
+from ..models.classes import CLASSES
+from ..models.detections import Detections
+
+__all__ = ["DetectedObjects", "Obstacle", "Obstacles", "PointLabels", "SensorFrame", "Truth"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,6 +56,58 @@ class SensorFrame:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class DetectedObjects:
+    """The boxes found in one frame, before tracking."""
+
+    sensor: SensorFrame
+    """The LiDAR frame."""
+    detections: Detections
+    missing_inputs: tuple[str, ...] = ()
+    """Inputs that this frame had to do without."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PointLabels:
+    """What perception says of each point of a LiDAR frame, in the order of `SensorFrame.points`."""
+
+    ground: np.ndarray
+    """True on the ground, shape (n,), bool."""
+    height: np.ndarray
+    """Above the ground [m], NaN where unknown, shape (n,), float32."""
+    clusters: np.ndarray
+    """Label of the cluster, −1 for none, shape (n,), int32."""
+    dropped: Mapping[str, int]
+    """Points that were left out, by reason: non_finite, out_of_range, ego, over_capacity."""
+
+    @classmethod
+    def unknown(cls, n: int) -> PointLabels:
+        """Nothing known of n points."""
+        return cls(
+            ground=np.zeros(n, bool),
+            height=np.full(n, np.nan, np.float32),
+            clusters=np.full(n, -1, np.int32),
+            dropped={},
+        )
+
+
+class Obstacle(NamedTuple):
+    """One object of a frame."""
+
+    id: int
+    """Its track."""
+    label: str
+    """Name of its class."""
+    score: float
+    """Confidence in [0, 1]."""
+    box: tuple[float, ...]
+    """x y z l w h [m], yaw [rad]."""
+    velocity: tuple[float, float]
+    """Along x and y [m/s]."""
+    kind: str
+    """`foreground`: a known class; `background`: a cluster of points."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Obstacles:
     """The objects around the vehicle in one frame: the output of perception."""
 
@@ -77,5 +134,33 @@ class Obstacles:
     missing_inputs: tuple[str, ...] = field(default=())
     """Inputs that this frame had to do without."""
 
+    @classmethod
+    def lost(cls, sensor: SensorFrame) -> Obstacles:
+        """No objects, because the frame was lost on the way."""
+        return cls(
+            version=sensor.version,
+            frame=sensor.index,
+            frame_id=sensor.frame_id,
+            velocity_reference="ego" if sensor.pose is None else "world",
+            ids=np.empty(0, np.int64),
+            classes=np.empty(0, np.int32),
+            scores=np.empty(0, np.float32),
+            boxes=np.empty((0, 7), np.float32),
+            velocities=np.empty((0, 2), np.float32),
+            background=np.empty(0, bool),
+            missing_inputs=("obstacles",),
+        )
+
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __iter__(self) -> Iterator[Obstacle]:
+        for i in range(len(self.ids)):
+            yield Obstacle(
+                int(self.ids[i]),
+                CLASSES[self.classes[i]],
+                float(self.scores[i]),
+                tuple(float(value) for value in self.boxes[i]),
+                (float(self.velocities[i, 0]), float(self.velocities[i, 1])),
+                "background" if self.background[i] else "foreground",
+            )

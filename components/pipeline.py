@@ -1,0 +1,326 @@
+"""The pipeline: LiDAR frames in, perceived frames out, by the modules of a profile."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, load_module, parse_overrides
+from ..datamesh import CommitPolicy, DataMesh, Entry, Output
+from ..errors import ConfigError, SourceError
+from ..kernels.device import resolve_device
+from .messages import Obstacles, PointLabels, SensorFrame
+from .profile import CONF, Profile, execution_context, load_profile
+
+__all__ = ["LIDAR_TOPIC", "OBSTACLES_TOPIC", "POINTS_TOPIC", "Latency", "PerceptionFrame", "Pipeline", "StageLatency"]
+
+LIDAR_TOPIC = "lidar/points"
+"""Where a pipeline commits its source's frames: the modules' input."""
+OBSTACLES_TOPIC = "perception/obstacles"
+"""Where the modules commit the objects of a frame."""
+POINTS_TOPIC = "perception/points"
+"""Where the modules commit what they say of each point."""
+
+_FRAMES_AHEAD = 8
+_RESULTS = (OBSTACLES_TOPIC, POINTS_TOPIC)
+
+
+@dataclass(frozen=True, slots=True)
+class StageLatency:
+    """Time that one stage took for one frame."""
+
+    wait_ms: float
+    """From when its inputs were there to its start [ms]."""
+    run_ms: float
+    """Its own work [ms]."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Time that one frame took."""
+
+    total_ms: float
+    """From the reception of the LiDAR frame to the commit of its obstacles, waits included [ms]."""
+    stages: dict[str, StageLatency] = field(default_factory=dict)
+    """By stage: the vertices of the graphs, as `component.vertex`."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PerceptionFrame:
+    """What was perceived in one LiDAR frame."""
+
+    sensor: SensorFrame
+    """The LiDAR frame itself, with the truth where its source knows it."""
+    objects: Obstacles
+    """The tracked objects; iterating gives them one by one. Empty where the frame was lost, see `failed`."""
+    ground: np.ndarray
+    """True where a point of `sensor.points` is on the ground, shape (n,), bool."""
+    height: np.ndarray
+    """Height of each point above the ground [m], NaN where unknown, shape (n,), float32."""
+    clusters: np.ndarray
+    """Label of each point's cluster, −1 for none, shape (n,), int32."""
+    latency: Latency
+    dropped: Mapping[str, int]
+    """Points that were left out, by reason."""
+    failed: bool = False
+    """True where no obstacles came out: a processor raised, or the frame was dropped on the way."""
+
+    @property
+    def version(self) -> int:
+        """Time of reception of the LiDAR frame [ns]."""
+        return self.sensor.version
+
+    @property
+    def index(self) -> int:
+        """Number of the frame in its source."""
+        return self.sensor.index
+
+    @property
+    def points(self) -> np.ndarray:
+        """The points of the LiDAR frame, shape (n, 4)."""
+        return self.sensor.points
+
+
+class Pipeline:
+    """Runs the modules of a profile over the frames of a source.
+
+    with wl.Pipeline.from_profile("cpu") as pipeline:
+        for frame in pipeline.run(wl.read("scans/")):
+            print(len(frame.objects), frame.latency.total_ms)
+    """
+
+    def __init__(self, profile: ConfigFile[Profile], modules: list[ConfigFile[ModuleSpec]], device: str) -> None:
+        """Builds the process, so that whatever is wrong with the configuration is said here.
+
+        Args:
+            profile: The profile.
+            modules: Its modules, with the settings in place.
+            device: The Warp device, resolved.
+        """
+        self._profile = profile
+        self._modules = modules
+        self.device = device
+        self._context = execution_context(profile, device)
+        self._timings: dict[int, list[VertexTiming]] = {}
+        self._timings_lock = threading.Lock()
+        self._process: Process | None = None
+        self._next: tuple[Process, bool] | None = (self._build(offline=True), True)
+        self._mesh = DataMesh()
+
+    @classmethod
+    def from_profile(
+        cls, name: str = "cpu", *, device: str | None = None, settings: Iterable[str] | Mapping[str, Any] = ()
+    ) -> Self:
+        """Makes the pipeline of a hardware profile.
+
+        Args:
+            name: Of a shipped profile, or the path of a file.
+            device: The Warp device, in place of the profile's.
+            settings: Changes by dotted key, as a mapping or as texts `key=value`: `component.vertex.key` for a module,
+                `profile.key` for the profile. Keys of the environment (`WARPLOOM__component__vertex__key`) come first.
+
+        Raises:
+            ConfigError: Profile, module or setting is bad.
+            DeviceError: There is no such device.
+            ModelError: A model does not fit its card.
+        """
+        overrides = parse_overrides(() if isinstance(settings, Mapping) else settings)
+        if isinstance(settings, Mapping):
+            overrides.update(settings)
+        changes = {tuple(key.split(".")): value for key, value in overrides.items()}
+        of_profile = {keys[1:]: value for keys, value in changes.items() if keys[0] == "profile"}
+        profile = load_profile(name, of_profile)
+        in_profile = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
+        of_modules = {**in_profile, **{keys: value for keys, value in changes.items() if keys[0] != "profile"}}
+        modules = [load_module(find_config(module, "modules", CONF), of_modules) for module in profile.content.modules]
+        known = {component.name for module in modules for component in module.content.components}
+        for keys in of_modules:
+            if keys[0] not in known:
+                raise ConfigError(
+                    f"setting {'.'.join(keys)}: no component {keys[0]!r}; there are: {', '.join(sorted(known))}, profile"
+                )
+        return cls(profile, modules, resolve_device(device or profile.content.device))
+
+    @property
+    def profile(self) -> Profile:
+        """The profile it was made from."""
+        return self._profile.content
+
+    @property
+    def losses(self) -> dict[str, dict[str, int]]:
+        """What the latest run lost: topic or component → reason → how many."""
+        return self._mesh.losses.as_dict()
+
+    def _build(self, *, offline: bool) -> Process:
+        return Process(
+            self._modules,
+            context=self._context,
+            external={LIDAR_TOPIC: SensorFrame},
+            offline=offline,
+            on_timing=self._record,
+        )
+
+    def _record(self, timing: VertexTiming) -> None:
+        with self._timings_lock:
+            self._timings.setdefault(timing.version, []).append(timing)
+
+    def run(self, source: Iterable[SensorFrame], *, realtime: bool = False) -> Iterator[PerceptionFrame]:
+        """Perceives the frames of a source, in their order.
+
+        Args:
+            source: Gives frames with rising versions.
+            realtime: Frames are fed at the pace of their versions, and what is too slow drops frames as its backlog
+                says, counted in `losses`. Otherwise nothing is dropped: every frame of the source comes out.
+
+        Yields:
+            One PerceptionFrame for each frame of the source, in its order.
+
+        Raises:
+            SourceError: The source failed; the frames before it have come out.
+        """
+        ready, self._next = self._next, None
+        process = ready[0] if ready is not None and ready[1] is not realtime else self._build(offline=not realtime)
+        self._process, self._mesh = process, process.mesh
+        with self._timings_lock:
+            self._timings.clear()
+        run = _Run(self, process, source, realtime)
+        try:
+            yield from run.frames()
+        finally:
+            run.stop()
+            process.stop()
+            self._process = None
+
+    def timings_of(self, version: int) -> list[VertexTiming]:
+        """Takes the timings of a frame, and lets go of those of frames before it."""
+        with self._timings_lock:
+            taken = self._timings.pop(version, [])
+            for old in [v for v in self._timings if v < version]:
+                del self._timings[old]
+            return taken
+
+    def close(self) -> None:
+        """Stops what runs."""
+        if self._process is not None:
+            self._process.stop()
+            self._process = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class _Run:
+    """One pass over a source: a thread commits its frames, the caller's thread collects what comes of them."""
+
+    def __init__(self, pipeline: Pipeline, process: Process, source: Iterable[SensorFrame], realtime: bool) -> None:
+        self._pipeline = pipeline
+        self._process = process
+        self._source = source
+        self._realtime = realtime
+        self._lidar: Output[SensorFrame] = Output()
+        self._lidar.bind("lidar", process.mesh.window(LIDAR_TOPIC))
+        self._events: queue.Queue[tuple[str, Any]] = queue.Queue()
+        # A caller who is slow to take frames holds up the source, and nothing piles up.
+        self._room = threading.Semaphore(_FRAMES_AHEAD)
+        self._stopping = threading.Event()
+        for topic in _RESULTS:
+            process.mesh.window(topic).subscribe(
+                lambda entry, topic=topic: self._events.put((topic, entry)),
+                lambda version, topic=topic: self._events.put((topic, version)),
+            )
+
+    def frames(self) -> Iterator[PerceptionFrame]:
+        """Starts the process and the source, and gives the frames as they are complete."""
+        self._process.start()
+        feeder = threading.Thread(target=self._feed, name="source", daemon=True)
+        feeder.start()
+        pending: dict[int, dict[str, Any]] = {}
+        exhausted, failure = False, None
+        while not exhausted or pending:
+            kind, event = self._events.get()
+            if kind == "frame":
+                pending.setdefault(event.version, {})["sensor"] = event
+            elif kind == "end":
+                exhausted, failure = True, event
+            else:
+                version = event.version if isinstance(event, Entry) else event
+                pending.setdefault(version, {})[kind] = event if isinstance(event, Entry) else None
+            while pending and (first := min(pending)) is not None and self._complete(pending[first]):
+                frame = self._assemble(pending.pop(first))
+                self._room.release()
+                if not (self._realtime and frame.failed):
+                    yield frame
+        feeder.join()
+        if failure is not None:
+            raise failure
+
+    @staticmethod
+    def _complete(parts: dict[str, Any]) -> bool:
+        return "sensor" in parts and all(topic in parts for topic in _RESULTS)
+
+    def _feed(self) -> None:
+        """Commits the source's frames; the last event says how it ended."""
+        failure: BaseException | None = None
+        try:
+            start_ns: tuple[int, int] | None = None
+            last = -1
+            for frame in self._source:
+                if frame.version <= last:
+                    raise SourceError(
+                        f"frame {frame.index} has version {frame.version} ns, not above {last} ns of the frame before it; "
+                        "a source must give rising versions"
+                    )
+                last = frame.version
+                if self._realtime:
+                    start_ns = start_ns or (frame.version, time.perf_counter_ns())
+                    due = start_ns[1] + frame.version - start_ns[0]
+                    self._stopping.wait(max(0.0, (due - time.perf_counter_ns()) / 1e9))
+                self._room.acquire()
+                if self._stopping.is_set():
+                    break
+                with self._lidar.allocate_change() as change:
+                    change.set_version(frame.version)
+                    change.value = frame
+                    self._events.put(("frame", frame))
+                    self._lidar.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+        except BaseException as error:
+            failure = error
+        self._events.put(("end", failure))
+
+    def _assemble(self, parts: dict[str, Any]) -> PerceptionFrame:
+        sensor: SensorFrame = parts["sensor"]
+        obstacles, points = parts[OBSTACLES_TOPIC], parts[POINTS_TOPIC]
+        n = len(sensor.points)
+        stages = {
+            f"{timing.component}.{timing.vertex}": StageLatency(timing.wait_ms, timing.run_ms)
+            for timing in self._pipeline.timings_of(sensor.version)
+        }
+        total = (obstacles.committed_ns - obstacles.received_ns) / 1e6 if obstacles is not None else float("nan")
+        labels = points.value if points is not None else PointLabels.unknown(n)
+        return PerceptionFrame(
+            sensor=sensor,
+            objects=obstacles.value if obstacles is not None else Obstacles.lost(sensor),
+            ground=labels.ground,
+            height=labels.height,
+            clusters=labels.clusters,
+            latency=Latency(total, stages),
+            dropped=labels.dropped,
+            failed=obstacles is None,
+        )
+
+    def stop(self) -> None:
+        """Lets the feeder end, also when it waits for room."""
+        self._stopping.set()
+        self._room.release()
