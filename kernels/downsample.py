@@ -187,9 +187,8 @@ def _mark_lowest(
     i = wp.tid()
     head = int(0)
     slot = slot_in[i]
-    if slot >= 0:
-        if lowest_in[slot] == i:
-            head = 1
+    if slot >= 0 and lowest_in[slot] == i:
+        head = 1
     head_out[i] = head
 
 
@@ -233,7 +232,7 @@ class VoxelDownsample:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`. Results are equal."""
+    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
     centroids: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (capacity,), vec3 [m], ordered by the lowest index of a point in the voxel."""
     centroid_count: wp.array = field(init=False, repr=False, compare=False)
@@ -329,8 +328,6 @@ def voxel_downsample(points: Any, voxel_size: float) -> Any:
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
-    plan = plan_for(
-        VoxelDownsample, voxel_size=float(voxel_size), capacity=capacity_for(n), device=borrowed.device
-    )
+    plan = plan_for(VoxelDownsample, voxel_size=float(voxel_size), capacity=capacity_for(n), device=borrowed.device)
     plan.launch(borrowed.xyz, count_on(n, borrowed.device))
     return give(plan.centroids[: int(plan.centroid_count.numpy()[0])], borrowed.family)

@@ -1,4 +1,4 @@
-"""Voxelization, hard and with fixed capacities: the first points of each voxel, as a network for point clouds wants them.
+"""Voxelization, hard and with fixed capacities: the first points of each voxel, as networks for point clouds want them.
 
 First come, first served: voxels are numbered by the lowest index of a point in them, and keep their first points in
 the order of the input. A CPU does just that, in one pass over a dense grid, or a hash table where a grid would be too
@@ -234,9 +234,7 @@ def _mark_heads(
     head = int(0)
     key = key_in[j]
     if key < grid.total:
-        if j == 0:
-            head = 1
-        elif key_in[j - 1] != key:
+        if j == 0 or key_in[j - 1] != key:
             head = 1
     head_out[j] = head
     if head == 1:
@@ -297,10 +295,7 @@ def _fill_sorted(
         wp.atomic_add(dropped_out, _DROPPED_POINTS, 1)
     if rank == 0:
         _write_coords(key, grid, voxel, coords_out)
-    ends = j == last
-    if not ends:
-        ends = key_in[j + 1] != key
-    if ends:
+    if j == last or key_in[j + 1] != key:
         counts_out[voxel] = wp.min(rank + 1, max_points)
 
 
@@ -323,7 +318,7 @@ class Voxelize:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. The results are equal."""
+    """`in_order` (one thread), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. Results are equal."""
 
     features: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (max_voxels, max_points, columns), float32; zero where a voxel has no point."""
@@ -383,7 +378,6 @@ class Voxelize:
             buffer("_point", 2 * self.capacity, wp.int32)
             for name in ("_first", "_number", "_head", "_segment", "_start"):
                 buffer(name, self.capacity, wp.int32)
-
 
     def launch(self, xyz: wp.array, count: wp.array, extra: wp.array | None = None) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
