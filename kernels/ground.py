@@ -1,0 +1,648 @@
+"""Ground segmentation: which points are ground, and how high every point stands above it.
+
+A polar sweep, after the idea of FugSeg and of line fitting before it (Himmelsbach, von Hundelshausen, Wünsche: Fast
+segmentation of 3D point clouds for ground vehicles, IV 2010). The lowest point of each cell of a polar grid is a sample
+of the surface. A plane through the samples near the sensor (RANSAC, then least squares) gives the sensor's height and
+tilt. Each segment of the grid is walked outwards from that plane, taking the samples that a road, a kerb or a slope can
+reach, and each cell is held to the median of its neighbours across segments. A point is judged by its height above the
+surface of its cell: strictly where something stands on the cell, loosely where nothing does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import adopt, borrow_points, count_on, give
+from .plan import capacity_for, plan_for
+
+__all__ = ["Ground", "GroundSegment", "elevation_grid", "segment_ground"]
+
+# Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
+
+# The polar grid. A ring is an eighth of an octave of r², so its width is 3 to 6 % of its radius: the float's own bits
+# name it. Segments divide the diamond |x| + |y| = 1 evenly, so they are 0.9 to 1.8° wide.
+_SEGMENTS = wp.constant(256)
+_RINGS = wp.constant(128)
+_RING_BITS = wp.constant(20)
+_FIRST_RING = wp.constant(127 * 8)  # the upper bits of 1 m²
+_FARTHEST = wp.constant(65536.0)  # r² where the last ring ends
+
+# The patches whose lowest points the plane is fitted to: 32 sectors, 8 octaves of r² from 2 to 32 m.
+_BANDS = wp.constant(8)
+_CANDIDATES = wp.constant(256)
+_FIRST_BAND_RING = wp.constant(16)
+_HYPOTHESES = wp.constant(128)
+_DRAWS = wp.constant(64)
+_NOWHERE = wp.constant(1.0e9)
+_STEEPEST = wp.constant(0.35)  # slope of the plane against the sensor, tan 19°
+_HEIGHT_SLACK = wp.constant(0.5)  # [m] between the height given and the plane found
+_DEFAULT_HEIGHT = wp.constant(1.8)
+
+# The sweep.
+_START = wp.constant(2.5)  # [m] from the sensor, where the plane itself is the last sample
+_STEP = wp.constant(0.2)  # [m] a sample may lie off the prediction, a kerb
+_STEP_PER_METRE = wp.constant(0.03)  # and more after a gap
+_SLOPE_MEMORY = wp.constant(1.0)  # [m] of way in which the slope is learnt
+_SLOPE_LIMIT = wp.constant(0.12)  # of the surface against the plane
+_EXTEND = wp.constant(2.0)  # [m] that the last slope holds beyond the last sample
+
+# The verdict.
+_OFF_MEDIAN = wp.constant(0.02)  # [m] a cell may lie off its neighbours' median
+_GRADIENT_LIMIT = wp.constant(0.15)
+_STANDS_FROM = wp.constant(0.25)  # [m] above the surface where a thing that stands on a cell has points,
+_STANDS_LEVELS = wp.constant(wp.uint64(63))  # up to 1.5 m more: six levels of 0.25 m
+_TOP_BARE = wp.constant(0.32)  # [m] up to which points are ground on a bare cell
+_TOP_OCCUPIED = wp.constant(0.07)  # and on one where something stands
+_BOTTOM = wp.constant(0.3)  # [m] below which a point is noise
+_BOTTOM_PER_METRE = wp.constant(0.02)
+
+_HASH = wp.constant(wp.uint32(2654435761))
+_LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))
+_FIX = wp.constant(wp.float64(1048576.0))
+
+
+@wp.func
+def _cell_of(x: float, y: float) -> int:
+    """The polar cell of a position: segment × rings + ring."""
+    # The angle as the diamond's, 0 to 4: monotone in the true one, for one division.
+    angle = x / (wp.abs(x) + wp.abs(y) + 1.0e-30)
+    angle = wp.where(y < 0.0, 3.0 + angle, 1.0 - angle)
+    segment = int(angle * (float(_SEGMENTS) * 0.25)) & (_SEGMENTS - 1)
+    ring = (wp.cast(x * x + y * y, wp.int32) >> _RING_BITS) - _FIRST_RING
+    return segment * _RINGS + wp.clamp(ring, 0, _RINGS - 1)
+
+
+@wp.kernel
+def _bin_points(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    # in out: zero
+    cells: wp.array2d(dtype=wp.int64),
+    # out
+    cell_out: wp.array(dtype=wp.int32),
+):
+    """The cell of each point; per cell its lowest point, and the levels of 0.25 m (modulo 16 m) that have points."""
+    i = wp.tid()
+    if i >= count_in[0]:
+        return
+    p = xyz_in[i]
+    if not (wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) < 3.0e38):
+        cell_out[i] = -1
+        return
+    cell = _cell_of(p[0], p[1])
+    cell_out[i] = cell
+    z = wp.clamp(p[2], -999.0, 999.0)
+    depth = wp.int64(int((1000.0 - z) * 1000.0))
+    wp.atomic_max(cells, cell, 0, (depth << wp.int64(32)) | (_LOW_WORD - wp.int64(i)))
+    level = int((1000.0 + z) * 4.0) & 63
+    wp.atomic_or(cells, cell, 1, wp.int64(1) << wp.int64(level))
+
+
+@wp.func
+def _lowest_point(xyz: wp.array(dtype=wp.vec3), key: wp.int64) -> wp.vec3:
+    return xyz[int(_LOW_WORD - (key & _LOW_WORD))]
+
+
+@wp.kernel
+def _pick_candidates(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells_in: wp.array2d(dtype=wp.int64),
+    # out
+    candidate_out: wp.array(dtype=wp.vec3),
+):
+    """The lowest point of each patch around the sensor."""
+    patch = wp.tid()
+    sector = patch / _BANDS
+    band = patch % _BANDS
+    best = wp.int64(0)
+    for s in range(8):
+        for k in range(8):
+            best = wp.max(best, cells_in[(sector * 8 + s) * _RINGS + _FIRST_BAND_RING + band * 8 + k, 0])
+    if best == wp.int64(0):
+        candidate_out[patch] = wp.vec3(0.0, 0.0, _NOWHERE)
+    else:
+        candidate_out[patch] = _lowest_point(xyz_in, best)
+
+
+@wp.func
+def _above(plane: wp.vec3, p: wp.vec3) -> float:
+    """The height of a point above the plane z = a x + b y + c."""
+    return p[2] - plane[0] * p[0] - plane[1] * p[1] - plane[2]
+
+
+@wp.func
+def _plane_tolerance(p: wp.vec3) -> float:
+    return 0.1 + 0.01 * wp.sqrt(p[0] * p[0] + p[1] * p[1])
+
+
+@wp.func
+def _hypothesis(candidates: wp.array(dtype=wp.vec3), number: int) -> wp.vec3:
+    """The plane a b c through three candidates drawn by a fixed hash; c is nowhere if they give none."""
+    state = wp.uint32(number) * _HASH + wp.uint32(12345)
+    p = wp.vec3(0.0, 0.0, _NOWHERE)
+    q = wp.vec3(0.0, 0.0, _NOWHERE)
+    s = wp.vec3(0.0, 0.0, _NOWHERE)
+    drawn = wp.int32(0)
+    while drawn < _DRAWS and s[2] == _NOWHERE:
+        drawn += 1
+        state = state * wp.uint32(1664525) + wp.uint32(1013904223)
+        candidate = candidates[int(state >> wp.uint32(24))]
+        if candidate[2] != _NOWHERE:
+            if p[2] == _NOWHERE:
+                p = candidate
+            elif q[2] == _NOWHERE:
+                if wp.length(candidate - p) > 3.0:
+                    q = candidate
+            else:
+                area = (q[0] - p[0]) * (candidate[1] - p[1]) - (q[1] - p[1]) * (candidate[0] - p[0])
+                if wp.abs(area) > 12.0:
+                    s = candidate
+    if s[2] == _NOWHERE:
+        return s
+    normal = wp.cross(q - p, s - p)
+    a = -normal[0] / normal[2]
+    b = -normal[1] / normal[2]
+    return wp.vec3(a, b, p[2] - a * p[0] - b * p[1])
+
+
+@wp.kernel
+def _vote_planes(
+    # in
+    candidate_in: wp.array(dtype=wp.vec3),
+    sensor_height: float,
+    # in out: zero
+    best: wp.array(dtype=wp.int64),
+):
+    """Scores a hypothesis by the candidates on it, less those under it."""
+    number = wp.tid()
+    plane = _hypothesis(candidate_in, number)
+    if plane[2] == _NOWHERE or plane[0] * plane[0] + plane[1] * plane[1] > _STEEPEST * _STEEPEST:
+        return
+    if wp.abs(plane[2] + sensor_height) > _HEIGHT_SLACK:  # never where the height is not given, NaN
+        return
+    score = wp.int32(0)
+    for j in range(_CANDIDATES):
+        p = candidate_in[j]
+        off = _above(plane, p)
+        if wp.abs(off) < _plane_tolerance(p):
+            score += 2
+        elif off < 0.0:
+            score -= 1
+    if score > 0:
+        wp.atomic_max(best, 0, (wp.int64(score) << wp.int64(32)) | wp.int64(_HYPOTHESES - number))
+
+
+@wp.kernel
+def _sum_inliers(
+    # in
+    candidate_in: wp.array(dtype=wp.vec3),
+    best_in: wp.array(dtype=wp.int64),
+    # in out: zero
+    sums: wp.array(dtype=wp.int64),
+):
+    """Normal equations of the least-squares plane through the winner's candidates, in fixed point."""
+    if best_in[0] == wp.int64(0):
+        return
+    plane = _hypothesis(candidate_in, _HYPOTHESES - int(best_in[0] & _LOW_WORD))
+    p = candidate_in[wp.tid()]
+    off = _above(plane, p)
+    if wp.abs(off) < _plane_tolerance(p):
+        x = wp.float64(p[0])
+        y = wp.float64(p[1])
+        z = wp.float64(off)
+        wp.atomic_add(sums, 0, wp.int64(1))
+        wp.atomic_add(sums, 1, wp.int64(x * _FIX))
+        wp.atomic_add(sums, 2, wp.int64(y * _FIX))
+        wp.atomic_add(sums, 3, wp.int64(z * _FIX))
+        wp.atomic_add(sums, 4, wp.int64(x * x * _FIX))
+        wp.atomic_add(sums, 5, wp.int64(x * y * _FIX))
+        wp.atomic_add(sums, 6, wp.int64(y * y * _FIX))
+        wp.atomic_add(sums, 7, wp.int64(x * z * _FIX))
+        wp.atomic_add(sums, 8, wp.int64(y * z * _FIX))
+
+
+@wp.func
+def _fitted_plane(
+    candidates: wp.array(dtype=wp.vec3),
+    best: wp.array(dtype=wp.int64),
+    sums: wp.array(dtype=wp.int64),
+    sensor_height: float,
+) -> wp.vec3:
+    """The plane of the ground near the sensor, or the level one at the height given or usual if none was found."""
+    if best[0] == wp.int64(0):
+        return wp.vec3(0.0, 0.0, -wp.where(wp.isnan(sensor_height), _DEFAULT_HEIGHT, sensor_height))
+    plane = _hypothesis(candidates, _HYPOTHESES - int(best[0] & _LOW_WORD))
+    n = wp.float64(sums[0]) * _FIX
+    x = wp.float64(sums[1]) / n
+    y = wp.float64(sums[2]) / n
+    z = wp.float64(sums[3]) / n
+    xx = wp.float64(sums[4]) / n - x * x
+    xy = wp.float64(sums[5]) / n - x * y
+    yy = wp.float64(sums[6]) / n - y * y
+    xz = wp.float64(sums[7]) / n - x * z
+    yz = wp.float64(sums[8]) / n - y * z
+    determinant = xx * yy - xy * xy
+    if determinant < wp.float64(1.0):
+        return plane
+    a = (xz * yy - yz * xy) / determinant
+    b = (yz * xx - xz * xy) / determinant
+    return plane + wp.vec3(float(a), float(b), float(z - a * x - b * y))
+
+
+@wp.kernel
+def _sweep_segments(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells_in: wp.array2d(dtype=wp.int64),
+    candidate_in: wp.array(dtype=wp.vec3),
+    best_in: wp.array(dtype=wp.int64),
+    sums_in: wp.array(dtype=wp.int64),
+    radius_in: wp.array(dtype=wp.float32),
+    sensor_height: float,
+    # out
+    plane_out: wp.array(dtype=wp.vec3),
+    sensor_height_out: wp.array(dtype=wp.float32),
+    rise_out: wp.array(dtype=wp.float32),
+):
+    """Walks a segment outwards over its samples; out: how far the surface rises above the plane in each cell."""
+    segment = wp.tid()
+    plane = _fitted_plane(candidate_in, best_in, sums_in, sensor_height)
+    if segment == 0:
+        plane_out[0] = plane
+        sensor_height_out[0] = -plane[2] / wp.sqrt(1.0 + plane[0] * plane[0] + plane[1] * plane[1])
+    first = segment * _RINGS
+    last_r = wp.float32(_START)
+    last_rise = wp.float32(0.0)
+    slope = wp.float32(0.0)
+    below_rise = wp.float32(_NOWHERE)  # of the last sample that lay too low
+    below_r = wp.float32(0.0)
+    filled = wp.int32(0)  # the rings before this one have their rise
+    for ring in range(_RINGS):
+        key = cells_in[first + ring, 0]
+        if key != wp.int64(0):
+            p = _lowest_point(xyz_in, key)
+            r = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+            rise = _above(plane, p)
+            run = wp.max(r - last_r, 0.05)
+            off = rise - last_rise - slope * run
+            taken = wp.abs(off) <= _STEP + _STEP_PER_METRE * run
+            if not taken and off < 0.0:
+                # One low sample is noise. Two that agree are the ground, and what was taken before stood on it.
+                if wp.abs(rise - below_rise) < _STEP + _STEP_PER_METRE * (r - below_r):
+                    taken = True
+                    last_rise = below_rise
+                    last_r = below_r
+                    run = wp.max(r - last_r, 0.05)
+                    slope = 0.0
+                else:
+                    below_rise = rise
+                    below_r = r
+            if taken:
+                for k in range(filled, ring + 1):
+                    share = wp.clamp((radius_in[k] - last_r) / run, 0.0, 1.0)
+                    rise_out[first + k] = last_rise + share * (rise - last_rise)
+                filled = ring + 1
+                steepness = wp.clamp((rise - last_rise) / run, -_SLOPE_LIMIT, _SLOPE_LIMIT)
+                slope += run / (run + _SLOPE_MEMORY) * (steepness - slope)
+                last_rise = rise
+                last_r = r
+                below_rise = _NOWHERE
+    for k in range(filled, _RINGS):
+        rise_out[first + k] = last_rise + slope * wp.clamp(radius_in[k] - last_r, 0.0, _EXTEND)
+
+
+@wp.func
+def _median5(a: float, b: float, c: float, d: float, e: float) -> float:
+    low = wp.max(wp.min(a, b), wp.min(c, d))
+    high = wp.min(wp.max(a, b), wp.max(c, d))
+    return wp.max(wp.min(low, high), wp.min(wp.max(low, high), e))
+
+
+@wp.func
+def _reconciled(rise: wp.array(dtype=wp.float32), radius: wp.array(dtype=wp.float32), cell: int) -> wp.vec2:
+    """The rise in the middle of a cell, held to the median across segments, and its gradient outwards."""
+    last = _SEGMENTS * _RINGS - 1
+    own = rise[cell]
+    median = _median5(
+        rise[(cell - 2 * _RINGS) & last],
+        rise[(cell - _RINGS) & last],
+        own,
+        rise[(cell + _RINGS) & last],
+        rise[(cell + 2 * _RINGS) & last],
+    )
+    ring = cell & (_RINGS - 1)
+    inner = wp.max(ring - 1, 0)
+    outer = wp.min(ring + 1, _RINGS - 1)
+    gradient = (rise[cell - ring + outer] - rise[cell - ring + inner]) / (radius[outer] - radius[inner])
+    return wp.vec2(
+        wp.clamp(own, median - _OFF_MEDIAN, median + _OFF_MEDIAN),
+        wp.clamp(gradient, -_GRADIENT_LIMIT, _GRADIENT_LIMIT),
+    )
+
+
+@wp.kernel
+def _judge_cells(
+    # in
+    cells_in: wp.array2d(dtype=wp.int64),
+    rise_in: wp.array(dtype=wp.float32),
+    radius_in: wp.array(dtype=wp.float32),
+    centre_in: wp.array(dtype=wp.vec2),
+    plane_in: wp.array(dtype=wp.vec3),
+    # out
+    surface_out: wp.array(dtype=wp.vec4),
+):
+    """Per cell with points: the rise of its surface as u + v r², and the heights between which points are ground."""
+    cell = wp.tid()
+    if cells_in[cell, 0] == wp.int64(0):
+        return
+    surface = _reconciled(rise_in, radius_in, cell)
+    r = radius_in[cell & (_RINGS - 1)]
+    centre = centre_in[cell]
+    plane = plane_in[0]
+    z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
+    # A wall, a car, a trunk stands on the cell if the levels above its surface have points.
+    level = wp.uint64(int(wp.ceil((1000.0 + wp.clamp(z, -900.0, 900.0) + _STANDS_FROM) * 4.0)) & 63)
+    levels = wp.uint64(cells_in[cell, 1])
+    levels = (levels >> level) | (levels << ((wp.uint64(64) - level) & wp.uint64(63)))
+    top = wp.where((levels & _STANDS_LEVELS) == wp.uint64(0), _TOP_BARE, _TOP_OCCUPIED)
+    half = 0.5 * surface[1]
+    surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
+
+
+@wp.kernel
+def _judge_points(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    cell_in: wp.array(dtype=wp.int32),
+    plane_in: wp.array(dtype=wp.vec3),
+    surface_in: wp.array(dtype=wp.vec4),
+    # out
+    mask_out: wp.array(dtype=wp.bool),
+    height_out: wp.array(dtype=wp.float32),
+):
+    """The height of each point above the surface of its cell, and whether that is ground."""
+    i = wp.tid()
+    if i >= count_in[0]:
+        return
+    cell = cell_in[i]
+    if cell < 0:
+        mask_out[i] = False
+        height_out[i] = wp.nan
+        return
+    p = xyz_in[i]
+    surface = surface_in[cell]
+    r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
+    height = _above(plane_in[0], p) - surface[0] - surface[1] * r2
+    height_out[i] = height
+    mask_out[i] = height < surface[2] and height > surface[3]
+
+
+@wp.kernel
+def _sample_elevation(
+    # in
+    rise_in: wp.array(dtype=wp.float32),
+    radius_in: wp.array(dtype=wp.float32),
+    plane_in: wp.array(dtype=wp.vec3),
+    low: wp.vec2,
+    cell_size: float,
+    # out
+    elevation_out: wp.array2d(dtype=wp.float32),
+):
+    """The surface in the middle of each square of a grid."""
+    row, column = wp.tid()  # pyright: ignore[reportAssignmentType]
+    x = low[0] + (float(row) + 0.5) * cell_size
+    y = low[1] + (float(column) + 0.5) * cell_size
+    cell = _cell_of(x, y)
+    r = radius_in[cell & (_RINGS - 1)]
+    surface = _reconciled(rise_in, radius_in, cell)
+    plane = plane_in[0]
+    rise = surface[0] + 0.5 * surface[1] / r * (wp.min(x * x + y * y, _FARTHEST) - r * r)
+    elevation_out[row, column] = plane[0] * x + plane[1] * y + plane[2] + rise
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundSegment:
+    """A plan: workspace for clouds of up to `capacity` points; `launch` allocates nothing and reads nothing back."""
+
+    capacity: int
+    """Points that one launch can take."""
+    sensor_height: float | None = None
+    """Height of the frame's origin above the ground [m], held to within 0.5 m; None to estimate it in each launch."""
+    grid_range: tuple[float, float, float, float] = (-50.0, -50.0, 50.0, 50.0)
+    """xmin ymin xmax ymax of the elevation grid [m]."""
+    cell_size: float = 1.0
+    """Edge of a square of the elevation grid [m]."""
+    device: str = DEFAULT_DEVICE
+    """A Warp device, such as `cpu` or `cuda:0`."""
+
+    mask: wp.array = field(init=False, repr=False)
+    """Whether each point is ground, shape (capacity,), bool."""
+    height: wp.array = field(init=False, repr=False)
+    """Height of each point above the ground along z [m], shape (capacity,), float32; NaN where it is not finite."""
+    found_height: wp.array = field(init=False, repr=False)
+    """Distance of the frame's origin from the plane of the ground near it [m], shape (1,), float32."""
+    plane: wp.array = field(init=False, repr=False)
+    """That plane, z = a x + b y + c, as a b c, shape (1,), vec3."""
+    elevation: wp.array = field(init=False, repr=False)
+    """z of the ground in the middle of each square, row = x, column = y, float32; filled by `launch_elevation`."""
+
+    def __post_init__(self):
+        if self.capacity < 1:
+            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if self.sensor_height is not None and not math.isfinite(self.sensor_height):
+            raise ValueError(f"sensor_height must be finite [m] or None, not {self.sensor_height}")
+        if not self.cell_size > 0:
+            raise ValueError(f"cell_size must be > 0 m, not {self.cell_size}")
+        xmin, ymin, xmax, ymax = self.grid_range
+        if not (xmin < xmax and ymin < ymax):
+            raise ValueError(f"grid_range must be xmin ymin xmax ymax with min < max, not {self.grid_range}")
+        device = resolve_device(self.device)
+        squares = (max(1, round((xmax - xmin) / self.cell_size)), max(1, round((ymax - ymin) / self.cell_size)))
+
+        def keep(name: str, array: wp.array) -> None:
+            object.__setattr__(self, name, array)
+
+        def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
+            keep(name, wp.zeros(shape, dtype=dtype, device=device))
+
+        size = int(_SEGMENTS * _RINGS)
+        radius, centre = _grid_centres()
+        keep("_radius", wp.array(radius, dtype=wp.float32, device=device))
+        keep("_centre", wp.array(centre, dtype=wp.vec2, device=device))
+        # One array of what each launch clears: per cell two words, the best hypothesis, the sums of the fit.
+        buffer("_scratch", 2 * size + 10, wp.int64)
+        keep("_cells", self._scratch[: 2 * size].reshape((size, 2)))
+        keep("_best", self._scratch[2 * size : 2 * size + 1])
+        keep("_sums", self._scratch[2 * size + 1 :])
+        buffer("_cell", self.capacity, wp.int32)
+        buffer("_candidate", int(_CANDIDATES), wp.vec3)
+        buffer("_rise", size, wp.float32)
+        buffer("_surface", size, wp.vec4)
+        buffer("mask", self.capacity, wp.bool)
+        buffer("height", self.capacity, wp.float32)
+        buffer("found_height", 1, wp.float32)
+        buffer("plane", 1, wp.vec3)
+        buffer("elevation", squares, wp.float32)
+
+    def launch(self, xyz: wp.array, count: wp.array) -> None:
+        """Fills `mask`, `height`, `found_height` and `plane` from the first `count[0]` points.
+
+        Args:
+            xyz: Positions [m] in a frame with z up and the sensor on its z axis, shape (n,), vec3, n ≤ capacity.
+            count: Shape (1,), int32.
+        """
+        self._launch_into(xyz, count, self.mask, self.height)
+
+    def launch_elevation(self) -> None:
+        """Fills `elevation` from what the last `launch` found."""
+        self._run(
+            _sample_elevation,
+            self.elevation.shape,
+            [self._rise, self._radius, self.plane, wp.vec2(*self.grid_range[:2]), self.cell_size],
+            [self.elevation],
+        )
+
+    def _run(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _launch_into(self, xyz: wp.array, count: wp.array, mask: wp.array, height: wp.array) -> None:
+        n = xyz.shape[0]
+        if n > self.capacity:
+            raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
+        given = math.nan if self.sensor_height is None else self.sensor_height
+        self._scratch.zero_()
+        self._run(_bin_points, n, [xyz, count, self._cells], [self._cell])
+        # The plane near the sensor.
+        self._run(_pick_candidates, int(_CANDIDATES), [xyz, self._cells], [self._candidate])
+        self._run(_vote_planes, int(_HYPOTHESES), [self._candidate, given, self._best], [])
+        self._run(_sum_inliers, int(_CANDIDATES), [self._candidate, self._best, self._sums], [])
+        # The surface over it.
+        self._run(
+            _sweep_segments,
+            int(_SEGMENTS),
+            [xyz, self._cells, self._candidate, self._best, self._sums, self._radius, given],
+            [self.plane, self.found_height, self._rise],
+        )
+        self._run(
+            _judge_cells,
+            int(_SEGMENTS * _RINGS),
+            [self._cells, self._rise, self._radius, self._centre, self.plane],
+            [self._surface],
+        )
+        self._run(_judge_points, n, [xyz, count, self._cell, self.plane, self._surface], [mask, height])
+
+
+def _grid_centres() -> tuple[np.ndarray, np.ndarray]:
+    """The radius in the middle of each ring, and the middle of each cell."""
+    bits = (np.arange(_RINGS, dtype=np.int32) + _FIRST_RING << _RING_BITS) + (1 << (_RING_BITS - 1))
+    radius = np.sqrt(bits.astype(np.int32).view(np.float32))
+    angle = (np.arange(_SEGMENTS) + 0.5) * (4 / _SEGMENTS)
+    x = np.where(angle < 2, 1 - angle, angle - 3)
+    y = np.where(angle < 2, 1, -1) * (1 - np.abs(x))
+    directions = np.stack([x, y], axis=1) / np.hypot(x, y)[:, None]
+    centre = directions[:, None, :] * radius[None, :, None]
+    return radius, centre.reshape(-1, 2).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What `segment_ground` found."""
+
+    mask: Any
+    """Whether each point is ground, shape (n,), bool."""
+    height: Any
+    """Height of each point above the ground along z [m], shape (n,), float32; NaN for points that are not finite."""
+    sensor_height: float
+    """Distance of the frame's origin from the plane of the ground near it [m]."""
+
+
+def segment_ground(points: Any, *, sensor_height: float | None = None) -> Ground:
+    """Tells the ground from what stands on it.
+
+    The sensor may be tilted by up to 15°, the ground may be hilly, and points below it are told as noise (not ground).
+    Points within 1 m and beyond 256 m of the z axis share the innermost and outermost ring.
+
+    Args:
+        points: Positions [m] in a frame with z up and the sensor on its z axis, shape (n, 3 or more), floating.
+        sensor_height: Height of the frame's origin above the ground [m], if known, to within 0.5 m: zero in a vehicle's
+            frame that lies on the ground. By default it is estimated, and taken as 1.8 m where fewer than three patches
+            between 2 and 32 m have points.
+
+    Returns:
+        Mask and height, of the family and on the device of `points`, and the sensor's height.
+
+    Raises:
+        TypeError: `points` is not a floating array.
+        ValueError: It has not at least three columns, or `sensor_height` is not finite.
+    """
+    borrowed = borrow_points(points)
+    n = len(borrowed)
+    height = None if sensor_height is None else float(sensor_height)
+    plan = plan_for(GroundSegment, capacity=capacity_for(n), sensor_height=height, device=borrowed.device)
+    count = count_on(n, borrowed.device)
+    if borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, count)
+        mask, heights = give(plan.mask[:n], borrowed.family), give(plan.height[:n], borrowed.family)
+    else:
+        # Straight into arrays of their own.
+        host_mask, host_height = np.empty(n, bool), np.empty(n, np.float32)
+        plan._launch_into(
+            borrowed.xyz,
+            count,
+            wp.array(host_mask, dtype=wp.bool, copy=False, device=DEFAULT_DEVICE),
+            wp.array(host_height, dtype=wp.float32, copy=False, device=DEFAULT_DEVICE),
+        )
+        mask, heights = adopt(host_mask, borrowed.family), adopt(host_height, borrowed.family)
+    return Ground(mask, heights, float(plan.found_height.numpy()[0]))
+
+
+def elevation_grid(
+    points: Any,
+    *,
+    grid_range: Sequence[float] = (-50.0, -50.0, 50.0, 50.0),
+    cell_size: float = 1.0,
+    sensor_height: float | None = None,
+) -> Any:
+    """The ground's surface as a grid.
+
+    Args:
+        points: As for `segment_ground`.
+        grid_range: xmin ymin xmax ymax [m].
+        cell_size: Edge of a square [m].
+        sensor_height: As for `segment_ground`.
+
+    Returns:
+        z of the ground in the middle of each square [m], shape ((xmax − xmin) / cell_size, (ymax − ymin) / cell_size),
+        float32, row = x and column = y, both rising; of the family and on the device of `points`. Where no ground is
+        seen it is carried on from where some is.
+
+    Raises:
+        TypeError: `points` is not a floating array.
+        ValueError: A shape or a number does not fit; the message says which.
+    """
+    borrowed = borrow_points(points)
+    limits = tuple(float(limit) for limit in grid_range)
+    if len(limits) != 4:
+        raise ValueError(f"grid_range must have four numbers, xmin ymin xmax ymax, not {len(limits)}")
+    plan = plan_for(
+        GroundSegment,
+        capacity=capacity_for(len(borrowed)),
+        sensor_height=None if sensor_height is None else float(sensor_height),
+        grid_range=limits,
+        cell_size=float(cell_size),
+        device=borrowed.device,
+    )
+    plan.launch(borrowed.xyz, count_on(len(borrowed), borrowed.device))
+    plan.launch_elevation()
+    return give(plan.elevation, borrowed.family)
