@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, load_module, parse_overrides
+from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, load_module, nearest, parse_overrides
 from ..datamesh import CommitPolicy, DataMesh, Entry, Output
 from ..errors import ConfigError, SourceError
 from ..kernels.device import resolve_device
@@ -144,7 +144,7 @@ class Pipeline:
         for keys in of_modules:
             if keys[0] not in known:
                 raise ConfigError(
-                    f"setting {'.'.join(keys)}: no component {keys[0]!r}; there are: {', '.join(sorted(known))}, profile"
+                    f"setting {'.'.join(keys)}: no component {keys[0]!r}; {nearest(keys[0], {*known, 'profile'})}"
                 )
         return cls(profile, modules, resolve_device(device or profile.content.device))
 
@@ -279,8 +279,8 @@ class _Run:
             for frame in self._source:
                 if frame.version <= last:
                     raise SourceError(
-                        f"frame {frame.index} has version {frame.version} ns, not above {last} ns of the frame before it; "
-                        "a source must give rising versions"
+                        f"frame {frame.index} has version {frame.version} ns, not above {last} ns "
+                        "of the frame before it; a source must give rising versions"
                     )
                 last = frame.version
                 if self._realtime:

@@ -122,6 +122,7 @@ class Process:
             vertices = declare_vertices(file, keys, spec)
             for declared in vertices:
                 declared.vertex.processor.context = context
+                declared.vertex.processor.in_flight = spec.in_flight
                 declared.vertex.processor.component_inputs = component.inputs
                 declared.vertex.processor.component_outputs = component.outputs
         for direction, handles, topics in (
@@ -203,6 +204,8 @@ class Process:
         component.bind(self.mesh, {**topics, **unmapped})
         for declared in vertices:
             vertex = declared.vertex
+            vertex.processor.place = f"{spec.name}.{vertex.name}"
+            vertex.processor.losses = self.mesh.losses
             try:
                 vertex.processor.init(declared.config)
             except (ValueError, TypeError, KeyError) as error:

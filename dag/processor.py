@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, 
 
 from pydantic import BaseModel, ConfigDict
 
-from ..datamesh import Input, Output, Status
+from ..datamesh import Input, LossCounters, Output, Status
 from .trigger import Trigger
 
 __all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "declared_ports"]
@@ -105,6 +105,11 @@ class Processor:
     def __init__(self) -> None:
         self.name = type(self).__name__
         self.context: Any = None
+        self.in_flight = 1
+        """Frames that may be in the graph at once: a processor whose outputs are workspace needs as many of them."""
+        self.place = self.name
+        """Where losses are counted: component.vertex."""
+        self.losses = LossCounters()
         self.component_inputs: Mapping[str, Input] = {}
         self.component_outputs: Mapping[str, Output] = {}
         self.ports = declared_ports(type(self))

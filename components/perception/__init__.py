@@ -1,1 +1,21 @@
+"""The stages of perception as processors, each of which can be named in a module file and run alone."""
 
+from .background import BackgroundProcessor
+from .clustering import ClusterProcessor
+from .detection import DetectionProcessor
+from .filtering import FilterProcessor
+from .ground import GroundProcessor
+from .merging import MergeProcessor
+from .point_labels import PointLabelsProcessor
+from .tracking import TrackingProcessor
+
+__all__ = [
+    "BackgroundProcessor",
+    "ClusterProcessor",
+    "DetectionProcessor",
+    "FilterProcessor",
+    "GroundProcessor",
+    "MergeProcessor",
+    "PointLabelsProcessor",
+    "TrackingProcessor",
+]

@@ -1,0 +1,95 @@
+"""The first stage: uploads a frame and leaves out the points that cannot be used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import cycle
+
+import warp as wp
+from pydantic import model_validator
+
+from ...dag import In, Out, Processor, ProcessorConfig, Trigger
+from ...datamesh import Status
+from ...kernels.filters import PointFilter
+from ...kernels.interop import borrow_points
+from ..execution import ExecutionContext
+from ..messages import SensorFrame
+
+__all__ = ["FilterConfig", "FilterProcessor", "FilteredCloud"]
+
+Bounds = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredCloud:
+    """The points of a frame that passed the filter, on the device; valid until the frame has left the graph."""
+
+    sensor: SensorFrame
+    """The frame as it came."""
+    xyz: wp.array
+    """Positions in the sensor's frame [m], shape (n,), vec3."""
+    count: wp.array
+    """Number of points, shape (1,), int32: n."""
+    index: wp.array
+    """Row of each in `sensor.points`, shape (n,), int32."""
+    dropped: Mapping[str, int]
+    """Points that were left out, by reason."""
+
+
+class FilterConfig(ProcessorConfig):
+    """What is left out, in the sensor's frame."""
+
+    point_range: Bounds = (-100.0, -100.0, -10.0, 100.0, 100.0, 10.0)
+    """xmin ymin zmin xmax ymax zmax [m], outside of which points are left out; the upper bound is open."""
+    ego_box: Bounds | None = (-2.5, -1.2, -2.5, 2.5, 1.2, 0.5)
+    """The vehicle itself, whose points are left out, likewise; null where the LiDAR does not see it."""
+
+    @model_validator(mode="after")
+    def _bounds_in_order(self) -> FilterConfig:
+        for name in ("point_range", "ego_box"):
+            box = getattr(self, name)
+            if box is not None and not all(box[axis] < box[axis + 3] for axis in range(3)):
+                raise ValueError(f"{name} must be xmin ymin zmin xmax ymax zmax, each min below its max, not {box}")
+        return self
+
+
+class FilterProcessor(Processor):
+    """Leaves out points that are not finite, out of range, on the vehicle itself, or beyond the capacity."""
+
+    Config = FilterConfig
+    context: ExecutionContext
+
+    sensor: In[SensorFrame]
+    filtered: Out[FilteredCloud]
+
+    def init(self, config: FilterConfig) -> None:
+        """Makes a plan for each frame in flight."""
+        capacity, device = self.context.capacity, self.context.device
+        self._plans = cycle(
+            [
+                PointFilter(capacity=capacity, point_range=config.point_range, ego_box=config.ego_box, device=device)
+                for _ in range(self.in_flight)
+            ]
+        )
+
+    def process(self, trigger: Trigger) -> Status:
+        """Uploads and filters one frame."""
+        sensor = self.sensor.value
+        offered = len(sensor.points)
+        points = sensor.points[: self.context.capacity]
+        table = (
+            points if self.context.device == "cpu" else wp.array(points, dtype=wp.float32, device=self.context.device)
+        )
+        borrowed = borrow_points(table)
+        plan = next(self._plans)
+        plan.launch(borrowed.xyz, borrowed.intensity, wp.array([len(points)], dtype=wp.int32, device=plan.device))
+        n = int(plan.count.numpy()[0])
+        dropped = {
+            "non_finite": int(plan.non_finite.numpy()[0]),
+            "out_of_range": int(plan.out_of_range.numpy()[0]),
+            "ego": int(plan.ego.numpy()[0]),
+            "over_capacity": offered - len(points),
+        }
+        self.filtered.value = FilteredCloud(sensor, plan.xyz[:n], plan.count, plan.index[:n], dropped)
+        return Status.OK

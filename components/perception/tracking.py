@@ -1,0 +1,51 @@
+"""Tracking as a stage: detections of one frame after the other become objects with identity and velocity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...dag import In, Out, Processor, ProcessorConfig, Trigger
+from ...datamesh import Status
+from ...models.tracker import Tracker
+from ..messages import DetectedObjects, Obstacles
+
+__all__ = ["TrackingProcessor"]
+
+
+class TrackingProcessor(Processor):
+    """Keeps the tracks. Belongs in a monotonic component: it takes the frames one by one, in the order of versions."""
+
+    detected: In[DetectedObjects]
+    obstacles: Out[Obstacles]
+
+    def init(self, config: ProcessorConfig) -> None:
+        """Starts without tracks."""
+        self._tracker = Tracker()
+
+    def process(self, trigger: Trigger) -> Status:
+        """Takes up the detections of one frame."""
+        detected = self.detected.value
+        sensor, detections = detected.sensor, detected.detections
+        tracks = self._tracker.update(
+            sensor.version,
+            detections.boxes,
+            detections.scores,
+            detections.classes,
+            background=detections.background,
+            velocities=detections.velocities,
+            pose=sensor.pose,
+        )
+        self.obstacles.value = Obstacles(
+            version=sensor.version,
+            frame=sensor.index,
+            frame_id=sensor.frame_id,
+            velocity_reference="ego" if sensor.pose is None else "world",
+            ids=tracks.ids,
+            classes=tracks.classes,
+            scores=tracks.scores.astype(np.float32),
+            boxes=tracks.boxes.astype(np.float32),
+            velocities=tracks.velocities.astype(np.float32),
+            background=tracks.background,
+            missing_inputs=detected.missing_inputs,
+        )
+        return Status.OK
