@@ -1,0 +1,164 @@
+"""The card of a detection head: what its ONNX file takes, gives, was trained on and was measured to do.
+
+A head is two files side by side: the ONNX model and a YAML card that names it. A model that does not fit its card
+is refused before it runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from ..errors import ModelError
+from .classes import CLASSES
+
+__all__ = ["DEFAULT_CARD", "DecodeSpec", "HeadCard", "InputSpec", "OutputSpec", "file_sha256", "load_card", "save_card"]
+
+DEFAULT_CARD = Path(__file__).parent / "weights" / "pillar_center.yaml"
+"""The head that ships with warploom."""
+
+_HIGHEST_OPSET = 17
+_REGRESSION = ("dx", "dy", "z", "log_l", "log_w", "log_h", "cos_2yaw", "sin_2yaw", "cos_yaw", "sin_yaw")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class InputSpec(_Strict):
+    """The model's one input: pillars, as `kernels.pillar.PillarGrid` makes them."""
+
+    name: str
+    shape: tuple[int, int, int, int]
+    """1, C, H (along y), W (along x)."""
+    channels: tuple[str, ...]
+    """Names of the C channels, in order."""
+    point_range: tuple[float, float, float, float, float, float]
+    """xmin ymin zmin xmax ymax zmax [m]; x and y about the sensor, z above the ground."""
+    cell: float = Field(gt=0)
+    """Edge of a cell [m]."""
+
+
+class OutputSpec(_Strict):
+    """The model's one output: heat maps of the classes (logits), then the box at each cell."""
+
+    name: str
+    shape: tuple[int, int, int, int]
+    regression: tuple[str, ...]
+
+    @field_validator("regression")
+    @classmethod
+    def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if value != _REGRESSION:
+            raise ValueError(f"this version decodes {', '.join(_REGRESSION)}")
+        return value
+
+
+class DecodeSpec(_Strict):
+    """From maps to boxes."""
+
+    stride: int = Field(ge=1)
+    """Input cells along an edge of an output cell."""
+    score_threshold: float = Field(ge=0, le=1)
+    nms_iou: float = Field(gt=0, le=1)
+    """Of two boxes that overlap more than this from above, the better stays, whatever their classes."""
+    max_candidates: int = Field(ge=1)
+    max_objects: int = Field(ge=1)
+
+
+class HeadCard(_Strict):
+    """A head's card."""
+
+    name: str
+    description: str = ""
+    file: str
+    """The ONNX file, beside the card."""
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    opset: int = Field(ge=11, le=_HIGHEST_OPSET)
+    input: InputSpec
+    output: OutputSpec
+    classes: tuple[str, ...]
+    """Of the heat maps, in order."""
+    decode: DecodeSpec
+    training: dict[str, Any]
+    """Data, seed, frames, iterations, minutes, recipe."""
+    measured: dict[str, Any]
+    """Figures, each with its protocol."""
+    licence: str
+
+    @field_validator("classes")
+    @classmethod
+    def _classes_known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = [name for name in value if name not in CLASSES]
+        if unknown or not value:
+            raise ValueError(f"no class {', '.join(map(repr, unknown)) or 'at all'}; there are: {', '.join(CLASSES)}")
+        return value
+
+
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def load_card(path: str | Path) -> tuple[HeadCard, Path]:
+    """Reads a card and checks that its model is there, is the one it means, and that card and model agree in shape.
+
+    Args:
+        path: The YAML file.
+
+    Returns:
+        The card and the path of its ONNX file.
+
+    Raises:
+        ModelError: The card is missing or not valid, or the model is missing or has another sha256.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
+    try:
+        card = HeadCard.model_validate(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise ModelError(f"{path}: the card is not YAML: {error}") from error
+    except ValidationError as error:
+        reasons = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'card'}: {e['msg']}" for e in error.errors())
+        raise ModelError(f"{path}: the card is not valid: {reasons}") from error
+    _check_consistency(path, card)
+    model = path.parent / card.file
+    if not model.is_file():
+        raise ModelError(f"{path}: the card's model {model} is not there; put the ONNX file beside its card")
+    found = file_sha256(model)
+    if found != card.sha256:
+        raise ModelError(
+            f"{model}: its sha256 is {found}, but the card {path.name} says {card.sha256}; "
+            "the file was changed or is another one: fetch it again, or write a card for it"
+        )
+    return card, model
+
+
+def _check_consistency(path: Path, card: HeadCard) -> None:
+    """Refuses a card whose numbers contradict each other."""
+    spec, low, high = card.input, card.input.point_range[:3], card.input.point_range[3:]
+    columns, rows = (round((high[axis] - low[axis]) / spec.cell) for axis in (0, 1))
+    wanted_in = (1, len(spec.channels), rows, columns)
+    if spec.shape != wanted_in:
+        raise ModelError(f"{path}: input.shape {spec.shape} does not follow from channels, range and cell: {wanted_in}")
+    stride = card.decode.stride
+    wanted_out = (1, len(card.classes) + len(card.output.regression), rows // stride, columns // stride)
+    if card.output.shape != wanted_out:
+        raise ModelError(
+            f"{path}: output.shape {card.output.shape} does not follow from classes, regression and stride: "
+            f"{wanted_out}"
+        )
+
+
+def save_card(path: str | Path, card: HeadCard) -> None:
+    """Writes a card as YAML."""
+    content = yaml.safe_dump(card.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
+    Path(path).write_text(content, encoding="utf-8")

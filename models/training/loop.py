@@ -1,0 +1,280 @@
+"""The training loop: frames made by processes of their own, one network, a checkpoint that training resumes from."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from ...kernels.pillar import PillarGrid
+from .frames import Augmentation, TrainingFrame, augment, load_frame, save_frame, simulate_frame
+from .network import STRIDE, PillarCenterNet
+from .targets import draw_targets, loss
+
+__all__ = ["TrainingConfig", "TrainingResult", "make_frames", "train"]
+
+_log = logging.getLogger(__name__)
+
+_FIRST_TRAINING_SEED = 1_000_000
+"""Simulator seeds from here on are for training; evaluation uses lower ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """All that a training depends on. With `iterations` given, the weights follow from it and the seed alone."""
+
+    out: Path
+    """Folder for the checkpoint and the log."""
+    seed: int = 0
+    minutes: float | None = None
+    """Stop after this long; frames are drawn while more are being made."""
+    iterations: int | None = None
+    """Stop after so many steps; all frames are made first. Exactly one of the two is given."""
+    frames: int = 2000
+    """Simulated scenes."""
+    frames_folder: Path | None = None
+    """Where they are kept, and found again by the next training; None is `out`/frames."""
+    batch: int = 4
+    window: float = 40.0
+    """Half the edge of the square learnt from [m], a multiple of 8 cells."""
+    cell: float = 0.25
+    width: tuple[int, int, int] = (24, 48, 128)
+    depth: tuple[int, int] = (1, 1)
+    learning_rate: float = 3e-3
+    weight_decay: float = 0.01
+    average: float = 0.998
+    """Decay of the running average of the weights, which is what is exported."""
+    threads: int = 1
+    workers: int = 1
+    """Processes that make frames."""
+    augmentation: Augmentation = field(default_factory=Augmentation)
+
+    def __post_init__(self):
+        if (self.minutes is None) == (self.iterations is None):
+            raise ValueError("give either minutes or iterations, not both and not neither")
+        cells = 2.0 * self.window / self.cell
+        if cells != round(cells) or round(cells) % (4 * STRIDE):
+            raise ValueError(f"2 · window / cell must be a multiple of {4 * STRIDE}, not {cells}")
+
+    @property
+    def folder(self) -> Path:
+        """Where the frames are."""
+        return self.frames_folder or self.out / "frames"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingResult:
+    """The trained network and what is to be said of its training."""
+
+    network: PillarCenterNet
+    iterations: int
+    minutes: float
+    frames: int
+    losses: dict[str, float]
+
+
+def make_frames(
+    folder: Path, seeds: range, simulate: Callable[[int], TrainingFrame] = simulate_frame, nice: int = 0
+) -> None:
+    """Simulates the scenes of these seeds that are not in the folder yet."""
+    if nice:
+        os.nice(nice)
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        path = folder / f"{seed}.npz"
+        if not path.exists():
+            save_frame(path, simulate(seed))
+
+
+def _sample(
+    frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
+    """Input and targets of one variation of a frame."""
+    varied = augment(frame, rng, config.augmentation)
+    xyz = np.ascontiguousarray(varied.xyz)[: grid.capacity]
+    points = wp.array(ptr=xyz.ctypes.data, dtype=wp.vec3, shape=(len(xyz),), device="cpu")
+    grid.launch(points, wp.array([len(xyz)], dtype=wp.int32, device="cpu"), varied.sensor_height)
+    edge = round(2.0 * config.window / config.cell) // STRIDE
+    targets = draw_targets(
+        varied.boxes,
+        varied.classes,
+        varied.points_in,
+        (-config.window, -config.window),
+        config.cell * STRIDE,
+        (edge, edge),
+        ground=-varied.sensor_height,
+    )
+    return grid.grid.numpy()[0].copy(), targets.heat, targets.mask, targets.values, targets.weight
+
+
+def _batches(config: TrainingConfig, paths: Callable[[], list[Path]], start: int) -> Iterator[list[torch.Tensor]]:
+    """Batches without end; batch i depends on the seed, i and the frames there are."""
+    window = config.window
+    grid = PillarGrid(
+        point_range=(-window, -window, -2.0, window, window, 6.0), cell=config.cell, capacity=1 << 18, device="cpu"
+    )
+    iteration = start
+    while True:
+        rng = np.random.default_rng([config.seed, iteration])
+        there = paths()
+        samples = []
+        for choice in rng.integers(len(there), size=config.batch):
+            samples.append(_sample(load_frame(there[choice]), grid, config, rng))
+        yield [torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True)]
+        iteration += 1
+
+
+def _rate(progress: float, peak: float) -> float:
+    """One cycle: a short warm-up, then a cosine down to nearly nothing."""
+    if progress < 0.05:
+        return peak * (0.1 + 0.9 * progress / 0.05)
+    return peak * (0.002 + 0.998 * 0.5 * (1.0 + np.cos(np.pi * (progress - 0.05) / 0.95)))
+
+
+def _start_workers(config: TrainingConfig) -> list[multiprocessing.Process]:
+    context = multiprocessing.get_context("spawn")
+    seeds = range(_FIRST_TRAINING_SEED, _FIRST_TRAINING_SEED + config.frames)
+    started = []
+    for k in range(config.workers):
+        process = context.Process(
+            target=make_frames, args=(config.folder, seeds[k :: config.workers]), kwargs={"nice": 10}, daemon=True
+        )
+        process.start()
+        started.append(process)
+    return started
+
+
+def _frames_there(config: TrainingConfig) -> Callable[[], list[Path]]:
+    """A function that lists the frames there are, looking again every few seconds until all are."""
+    known: list[Path] = []
+    looked = -np.inf
+
+    def look() -> list[Path]:
+        nonlocal known, looked
+        if len(known) < config.frames and time.monotonic() - looked > 5.0:
+            names = (config.folder / f"{_FIRST_TRAINING_SEED + k}.npz" for k in range(config.frames))
+            known = [path for path in names if path.exists()]
+            looked = time.monotonic()
+        return known
+
+    return look
+
+
+def train(config: TrainingConfig) -> TrainingResult:
+    """Trains a head on simulated scenes; interrupted, the same call goes on from the last checkpoint.
+
+    Raises:
+        RuntimeError: No frames come: the processes that make them have ended.
+    """
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    config.out.mkdir(parents=True, exist_ok=True)
+    network = PillarCenterNet(config.width, config.depth).to(memory_format=torch.channels_last)
+    averaged = torch.optim.swa_utils.AveragedModel(
+        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
+    )
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    checkpoint = config.out / "checkpoint.pt"
+    iteration, spent = 0, 0.0
+    if checkpoint.exists():
+        state = torch.load(checkpoint, weights_only=True)
+        network.load_state_dict(state["network"])
+        averaged.load_state_dict(state["averaged"])
+        optimiser.load_state_dict(state["optimiser"])
+        iteration, spent = state["iteration"], state["minutes"]
+        _log.info("resuming from iteration %d, minute %.1f", iteration, spent)
+
+    workers = _start_workers(config)
+    there = _frames_there(config)
+    wanted = config.frames if config.iterations is not None else min(64, config.frames)
+    while len(there()) < wanted:
+        if not any(worker.is_alive() for worker in workers) and len(there()) < wanted:
+            time.sleep(5.1)  # what the last one wrote may not have been looked at
+            if len(there()) < wanted:
+                raise RuntimeError(f"the simulator ended with {len(there())} of {wanted} frames in {config.folder}")
+        time.sleep(0.5)
+
+    began = time.monotonic() - 60.0 * spent
+    running: dict[str, float] = {}
+
+    def save() -> None:
+        partial = checkpoint.with_suffix(".partial")
+        torch.save(
+            {
+                "network": network.state_dict(),
+                "averaged": averaged.state_dict(),
+                "optimiser": optimiser.state_dict(),
+                "iteration": iteration,
+                "minutes": (time.monotonic() - began) / 60.0,
+            },
+            partial,
+        )
+        os.replace(partial, checkpoint)
+
+    network.train()
+    last_saved = time.monotonic()
+    for batch in _batches(config, there, iteration):
+        minutes = (time.monotonic() - began) / 60.0
+        progress = iteration / config.iterations if config.iterations else minutes / float(config.minutes or 1.0)
+        if progress >= 1.0:
+            break
+        for group in optimiser.param_groups:
+            group["lr"] = _rate(progress, config.learning_rate)
+        pillars = batch[0].contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            maps = network(pillars)
+        total, parts = loss(maps, *batch[1:])
+        optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
+        optimiser.step()
+        averaged.update_parameters(network)
+        iteration += 1
+        for name, value in parts.items():
+            running[name] = 0.98 * running.get(name, value) + 0.02 * value
+        if iteration % 50 == 0:
+            _log.info(
+                "minute %.1f, iteration %d, %d frames: heat %.3f, box %.3f",
+                minutes,
+                iteration,
+                len(there()),
+                running["heat"],
+                running["box"],
+            )
+        if time.monotonic() - last_saved > 120.0:
+            save()
+            last_saved = time.monotonic()
+    save()
+    for worker in workers:
+        worker.terminate()
+        worker.join()
+    return TrainingResult(
+        network=averaged.module.eval(),
+        iterations=iteration,
+        minutes=(time.monotonic() - began) / 60.0,
+        frames=len(there()),
+        losses=running,
+    )
+
+
+def described(config: TrainingConfig, result: TrainingResult) -> dict[str, object]:
+    """What a card says of a training."""
+    recipe = replace(config, out=Path("."), frames_folder=None)
+    kept = {k: v for k, v in asdict(recipe).items() if k not in {"out", "frames_folder", "threads", "workers"}}
+    kept["augmentation"] = asdict(config.augmentation)
+    return {
+        "data": "scenes of warploom's simulator alone",
+        "seed": config.seed,
+        "frames": result.frames,
+        "iterations": result.iterations,
+        "minutes": round(result.minutes, 1),
+        "recipe": {k: v for k, v in kept.items() if k not in {"seed", "frames", "iterations", "minutes"}},
+    }

@@ -1,0 +1,120 @@
+"""What the network should say of a frame, and how far off it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from .network import HEAD_CLASSES, REGRESSION
+
+__all__ = ["Targets", "draw_targets", "loss"]
+
+# An object with fewer returns is neither asked for nor counted as false.
+_FEWEST_POINTS = np.array([5, 4, 4, 3, 4])
+# Spread of a peak [output cells]: about a third of the object's narrow side, never less than a cell needs.
+_LEAST_SPREAD = 0.7
+# Cells round the centre that learn the box too, so that a peak one cell off still gives a good one.
+_NEIGHBOURHOOD = 1
+_WEIGHTS = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.3, 0.3])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Targets:
+    """For one frame, on the output grid of H rows along y and W columns along x."""
+
+    heat: np.ndarray
+    """Shape (classes, H, W), float32: 1 at centres, falling off around them."""
+    mask: np.ndarray
+    """Shape (classes, H, W), float32: 0 where no answer is wrong."""
+    values: np.ndarray
+    """Shape (regression, H, W), float32."""
+    weight: np.ndarray
+    """Shape (H, W), float32: 0 where there is no box to learn."""
+
+
+def draw_targets(
+    boxes: np.ndarray,
+    classes: np.ndarray,
+    points_in: np.ndarray,
+    origin: tuple[float, float],
+    cell: float,
+    shape: tuple[int, int],
+    ground: float = 0.0,
+) -> Targets:
+    """Draws the maps of one frame.
+
+    Args:
+        boxes: Shape (k, 7); centres in the frame of the grid.
+        classes: Shape (k,), indices into `HEAD_CLASSES`; others are left out.
+        points_in: Returns of each object, shape (k,).
+        origin: Lowest x and y of the grid [m].
+        cell: Edge of an output cell [m].
+        shape: H, W.
+        ground: Height of the ground in the frame of the boxes, as the network is told [m].
+    """
+    height, width = shape
+    heat = np.zeros((len(HEAD_CLASSES), height, width), np.float32)
+    mask = np.ones_like(heat)
+    values = np.zeros((len(REGRESSION), height, width), np.float32)
+    weight = np.zeros((height, width), np.float32)
+    u = (boxes[:, 0] - origin[0]) / cell
+    v = (boxes[:, 1] - origin[1]) / cell
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (classes < len(HEAD_CLASSES))
+    # Far ones first, so that where two claim a cell the better seen has it.
+    for k in sorted(np.flatnonzero(inside), key=lambda k: int(points_in[k])):
+        z, length, wide, tall, yaw = (float(value) for value in boxes[k, 2:])
+        kind = int(classes[k])
+        column, row = int(u[k]), int(v[k])
+        if points_in[k] < _FEWEST_POINTS[kind]:
+            reach = int(np.ceil(0.5 * max(length, wide) / cell))
+            window = np.s_[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+            mask[kind][window] = 0.0
+            continue
+        spread = max(_LEAST_SPREAD, min(length, wide) / cell / 5.0)
+        reach = int(np.ceil(3.0 * spread))
+        rows = np.arange(max(row - reach, 0), min(row + reach + 1, height))
+        columns = np.arange(max(column - reach, 0), min(column + reach + 1, width))
+        square = (rows[:, None] - row) ** 2 + (columns[None, :] - column) ** 2
+        peak = np.exp(-square / (2.0 * spread * spread)).astype(np.float32)
+        window = np.ix_(rows, columns)
+        heat[kind][window] = np.maximum(heat[kind][window], peak)
+        log_size = np.log([max(length, 0.05), max(wide, 0.05), max(tall, 0.05)])
+        fixed = [z - ground, *log_size, np.cos(2 * yaw), np.sin(2 * yaw), np.cos(yaw), np.sin(yaw)]
+        for r in range(max(row - _NEIGHBOURHOOD, 0), min(row + _NEIGHBOURHOOD + 1, height)):
+            for c in range(max(column - _NEIGHBOURHOOD, 0), min(column + _NEIGHBOURHOOD + 1, width)):
+                own = 1.0 if (r, c) == (row, column) else 0.25
+                if own >= weight[r, c]:
+                    values[:, r, c] = [u[k] - c - 0.5, v[k] - r - 0.5, *fixed]
+                    weight[r, c] = own
+    return Targets(heat=heat, mask=mask, values=values, weight=weight)
+
+
+def loss(
+    maps: torch.Tensor, heat: torch.Tensor, mask: torch.Tensor, values: torch.Tensor, weight: torch.Tensor
+) -> tuple[torch.Tensor, dict[str, float]]:
+    """The penalty-reduced focal loss of the heat maps (CornerNet, Law & Deng 2018) and L1 of the boxes.
+
+    Args:
+        maps: What the network said, shape (n, classes + regression, H, W).
+        heat: As in `Targets`, batched, as are the others.
+        mask: Shape (n, classes, H, W).
+        values: Shape (n, regression, H, W).
+        weight: Shape (n, H, W).
+
+    Returns:
+        The sum, and its parts as numbers.
+    """
+    logits = maps[:, : len(HEAD_CLASSES)].float()
+    boxes = maps[:, len(HEAD_CLASSES) :].float()
+    probability = torch.sigmoid(logits)
+    peaks = heat >= 1.0
+    positive = -((1.0 - probability) ** 2) * functional.logsigmoid(logits) * peaks
+    negative = -(probability**2) * (1.0 - heat) ** 4 * functional.logsigmoid(-logits) * (~peaks) * mask
+    objects = peaks.sum().clamp(min=1)
+    focal = (positive.sum() + negative.sum()) / objects
+    scale = _WEIGHTS.to(boxes)[None, :, None, None] * weight[:, None]
+    box = ((boxes - values).abs() * scale).sum() / weight.sum().clamp(min=1.0)
+    return focal + 0.5 * box, {"heat": float(focal.detach()), "box": float(box.detach())}
