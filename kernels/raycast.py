@@ -1,0 +1,545 @@
+"""LiDAR ray casting: beams against instanced triangle meshes, and what a sensor makes of the echoes.
+
+Two levels of bounding volumes: one over the instances of a scene, rebuilt whenever they move, and one a mesh, built
+once. A ray is carried into the frame of each instance it may hit, so a thousand parked cars cost as little memory as one.
+Every face has a label: its material in the low byte (reflectivity, share of light that passes through), its class above.
+
+All that looks like chance (glass that lets a beam through, noise, lost echoes) is a hash of seed and beam, so the
+same scene gives the same bytes again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import resolve_device
+from .interop import borrow, family_of, give
+
+__all__ = ["MATERIALS", "LidarCast", "MeshSet", "RayHits", "raycast"]
+
+MATERIALS = 256
+"""Rows of a table of materials; the low byte of a face's label names its row."""
+
+_HASH_0, _HASH_1, _HASH_2, _HASH_3 = (
+    wp.constant(wp.uint32(prime)) for prime in (2654435761, 2246822519, 2246822507, 3266489909)
+)
+_MATERIAL_MASK = wp.constant(MATERIALS - 1)
+_CLASS_SHIFT = wp.constant(8)
+_REFLECTIVITY, _POROSITY, _LOSS, _GLOSS = (wp.constant(i) for i in range(4))
+# A beam passes at most this many porous faces of one instance: panes, leaves, meshes of a fence.
+_MAX_PASSES = wp.constant(6)
+_STEP = wp.constant(1.0e-3)  # [m] beyond a porous face, where the beam goes on
+_NO_HIT = wp.constant(-1)
+
+
+@wp.func
+def _uniform(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
+    """A number in [0, 1) from a hash of three integers (the finaliser of MurmurHash3)."""
+    h = seed ^ (a * _HASH_0) ^ (b * _HASH_1)
+    h = (h ^ (h >> wp.uint32(16))) * _HASH_2
+    h = (h ^ (h >> wp.uint32(13))) * _HASH_3
+    h = h ^ (h >> wp.uint32(16))
+    return float(h >> wp.uint32(8)) * (1.0 / 16777216.0)
+
+
+@wp.func
+def _gauss(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
+    """A standard normal number, by Box and Muller."""
+    u = wp.max(_uniform(seed, a, b), 1.0e-7)
+    v = _uniform(seed + wp.uint32(1), a, b)
+    return wp.sqrt(-2.0 * wp.log(u)) * wp.cos(6.2831853 * v)
+
+
+@wp.kernel
+def _cast(
+    # in: beams
+    beams_in: wp.array(dtype=wp.vec3),
+    fraction_in: wp.array(dtype=wp.float32),
+    pose_in: wp.array(dtype=wp.transform),
+    max_range: float,
+    seed_in: wp.array(dtype=wp.uint32),
+    # in: scene
+    scene: wp.uint64,
+    mesh_in: wp.array(dtype=wp.uint64),
+    first_face_in: wp.array(dtype=wp.int32),
+    rows_in: wp.array2d(dtype=wp.vec4),
+    label_in: wp.array(dtype=wp.int32),
+    material_in: wp.array2d(dtype=wp.float32),
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+    instance_out: wp.array(dtype=wp.int32),
+    face_out: wp.array(dtype=wp.int32),
+    hit_label_out: wp.array(dtype=wp.int32),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    """Finds the first face that each beam does not pass through."""
+    i = wp.tid()
+    f = fraction_in[i]
+    start = wp.transform_get_translation(pose_in[0])
+    end = wp.transform_get_translation(pose_in[1])
+    turn = wp.quat_slerp(wp.transform_get_rotation(pose_in[0]), wp.transform_get_rotation(pose_in[1]), f)
+    origin = start + f * (end - start)
+    direction = wp.normalize(wp.quat_rotate(turn, beams_in[i]))
+    seed = seed_in[0]
+
+    best = max_range
+    best_instance = int(_NO_HIT)
+    best_face = int(_NO_HIT)
+    best_label = int(_NO_HIT)
+    best_normal = wp.vec3(0.0, 0.0, 0.0)
+    item = int(0)
+    query = wp.bvh_query_ray(scene, origin, direction)
+    while wp.bvh_query_next(query, item, best):
+        r0 = rows_in[item, 0]
+        r1 = rows_in[item, 1]
+        r2 = rows_in[item, 2]
+        a0 = wp.vec3(r0[0], r0[1], r0[2])
+        a1 = wp.vec3(r1[0], r1[1], r1[2])
+        a2 = wp.vec3(r2[0], r2[1], r2[2])
+        local = wp.vec3(wp.dot(a0, origin) + r0[3], wp.dot(a1, origin) + r1[3], wp.dot(a2, origin) + r2[3])
+        along = wp.vec3(wp.dot(a0, direction), wp.dot(a1, direction), wp.dot(a2, direction))
+        base = first_face_in[item]
+        gone = float(0.0)
+        passes = int(0)
+        while passes < _MAX_PASSES:
+            passes += 1
+            hit = wp.mesh_query_ray(mesh_in[item], local + gone * along, along, best - gone)
+            if not hit.result:
+                break
+            t = gone + hit.t
+            label = label_in[base + hit.face]
+            porosity = material_in[label & _MATERIAL_MASK, _POROSITY]
+            through = porosity > 0.0 and _uniform(seed + wp.uint32(item), wp.uint32(i), wp.uint32(hit.face)) < porosity
+            if through and passes < _MAX_PASSES:
+                gone = t + _STEP
+                if gone >= best:
+                    break
+            else:
+                if t < best or (t == best and item < best_instance):
+                    best = t
+                    best_instance = item
+                    best_face = hit.face
+                    best_label = label
+                    n = hit.normal
+                    best_normal = wp.normalize(n[0] * a0 + n[1] * a1 + n[2] * a2)
+                break
+    distance_out[i] = wp.where(best_instance >= 0, best, 0.0)
+    instance_out[i] = best_instance
+    face_out[i] = best_face
+    hit_label_out[i] = best_label
+    normal_out[i] = best_normal
+
+
+@wp.kernel
+def _sense(
+    # in: hits
+    beams_in: wp.array(dtype=wp.vec3),
+    fraction_in: wp.array(dtype=wp.float32),
+    pose_in: wp.array(dtype=wp.transform),
+    distance_in: wp.array(dtype=wp.float32),
+    hit_label_in: wp.array(dtype=wp.int32),
+    normal_in: wp.array(dtype=wp.vec3),
+    material_in: wp.array2d(dtype=wp.float32),
+    seed_in: wp.array(dtype=wp.uint32),
+    # in: sensor
+    min_range: float,
+    reach: float,
+    range_noise: float,
+    drop_out: float,
+    # out
+    kept_out: wp.array(dtype=wp.int32),
+    range_out: wp.array(dtype=wp.float32),
+    intensity_out: wp.array(dtype=wp.float32),
+):
+    """Makes an echo of each hit: its noisy range and its intensity, or none where it is too weak."""
+    i = wp.tid()
+    kept_out[i] = 0
+    d = distance_in[i]
+    if d < min_range or hit_label_in[i] < 0:
+        return
+    turn = wp.quat_slerp(wp.transform_get_rotation(pose_in[0]), wp.transform_get_rotation(pose_in[1]), fraction_in[i])
+    cosine = wp.abs(wp.dot(wp.quat_rotate(turn, beams_in[i]), normal_in[i]))
+    material = hit_label_in[i] & _MATERIAL_MASK
+    seed = seed_in[0] ^ wp.uint32(0x5BD1E995)
+    k = wp.uint32(i)
+    reflectivity = material_in[material, _REFLECTIVITY]
+    gloss = material_in[material, _GLOSS]
+    # Lambert's law, and for glossy paint a lobe around the normal; the texture varies by a fifth.
+    texture = 1.0 + 0.2 * _gauss(seed, k, wp.uint32(1))
+    echo = reflectivity * texture * ((1.0 - gloss) * cosine + gloss * wp.pow(cosine, 8.0))
+    # The signal falls with the square of the range; `reach` is where a tenth of full reflectivity is still seen half the time.
+    signal = echo / (d * d) * (reach * reach) * 10.0
+    seen = 1.0 / (1.0 + wp.pow(wp.max(signal, 1.0e-6), -3.0))
+    chance = _uniform(seed, k, wp.uint32(3))
+    if chance > seen * (1.0 - drop_out) * (1.0 - material_in[material, _LOSS]):
+        return
+    kept_out[i] = 1
+    range_out[i] = wp.max(d + range_noise * _gauss(seed, k, wp.uint32(5)), min_range)
+    intensity_out[i] = wp.clamp(echo, 0.0, 1.0)
+
+
+@wp.kernel
+def _compact(
+    # in
+    beams_in: wp.array(dtype=wp.vec3),
+    kept_in: wp.array(dtype=wp.int32),
+    rank_in: wp.array(dtype=wp.int32),
+    range_in: wp.array(dtype=wp.float32),
+    intensity_in: wp.array(dtype=wp.float32),
+    hit_label_in: wp.array(dtype=wp.int32),
+    hit_instance_in: wp.array(dtype=wp.int32),
+    beam_ring_in: wp.array(dtype=wp.uint16),
+    beam_time_in: wp.array(dtype=wp.float32),
+    # out
+    points_out: wp.array(dtype=wp.vec4),
+    ring_out: wp.array(dtype=wp.uint16),
+    t_out: wp.array(dtype=wp.float32),
+    point_class_out: wp.array(dtype=wp.int32),
+    instance_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """Writes the echoes one after the other, in the order of the beams."""
+    i = wp.tid()
+    if i == kept_in.shape[0] - 1:
+        count_out[0] = rank_in[i] + kept_in[i]
+    if kept_in[i] == 0:
+        return
+    k = rank_in[i]
+    p = range_in[i] * beams_in[i]
+    points_out[k] = wp.vec4(p[0], p[1], p[2], intensity_in[i])
+    ring_out[k] = beam_ring_in[i]
+    t_out[k] = beam_time_in[i]
+    point_class_out[k] = hit_label_in[i] >> _CLASS_SHIFT
+    instance_out[k] = hit_instance_in[i]
+
+
+class MeshSet:
+    """Triangle meshes with a label for each face; a mesh is added once and then named by its number."""
+
+    def __init__(self, device: str = "cpu", max_faces: int = 1 << 20):
+        self.device = resolve_device(device)
+        self.labels = wp.zeros(max_faces, dtype=wp.int32, device=self.device)
+        self._meshes: list[wp.Mesh | None] = []
+        self._first_face: list[int] = []
+        self._room: list[int] = []
+        self._bounds: list[np.ndarray] = []
+        self._faces = 0
+
+    def __len__(self) -> int:
+        return len(self._meshes)
+
+    def reserve(self, faces: int) -> int:
+        """Keeps room for a mesh of up to `faces` triangles that `replace` will bring, and returns its number."""
+        return self._append(None, faces, np.zeros((2, 3)))
+
+    def replace(self, number: int, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> None:
+        """Puts a mesh into a reserved place, instead of what was there.
+
+        Raises:
+            ValueError: Shapes do not fit, a corner does not exist, or there is no room for so many faces.
+        """
+        mesh, bounds = self._build(vertices, faces, labels)
+        if len(faces) > self._room[number]:
+            raise ValueError(f"faces must be at most {self._room[number]}, as reserved, not {len(faces)}")
+        self._meshes[number], self._bounds[number] = mesh, bounds
+        self._label(self._first_face[number], labels)
+
+    def add(self, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> int:
+        """Adds a mesh, builds its tree, and returns its number.
+
+        Args:
+            vertices: Shape (v, 3) [m].
+            faces: Corners of each triangle, shape (f, 3).
+            labels: Material + 256 × class of each face, shape (f,).
+
+        Raises:
+            ValueError: Shapes do not fit, a corner does not exist, or the set is full.
+        """
+        mesh, bounds = self._build(vertices, faces, labels)
+        number = self._append(mesh, len(faces), bounds)
+        self._label(self._first_face[number], labels)
+        return number
+
+    def _append(self, mesh: wp.Mesh | None, faces: int, bounds: np.ndarray) -> int:
+        if self._faces + faces > self.labels.shape[0]:
+            raise ValueError(f"max_faces must be at least {self._faces + faces}, not {self.labels.shape[0]}")
+        self._meshes.append(mesh)
+        self._first_face.append(self._faces)
+        self._room.append(faces)
+        self._bounds.append(bounds)
+        self._faces += faces
+        return len(self._meshes) - 1
+
+    def _label(self, first: int, labels: np.ndarray) -> None:
+        source = wp.array(np.ascontiguousarray(labels, np.int32), dtype=wp.int32, device=self.device)
+        wp.copy(self.labels, source, dest_offset=first, count=len(labels))
+
+    def _build(self, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> tuple[wp.Mesh, np.ndarray]:
+        """The mesh with its tree, and its lowest and highest corner."""
+        vertices = np.ascontiguousarray(vertices, np.float32)
+        faces = np.ascontiguousarray(faces, np.int32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+            raise ValueError(f"vertices must be (v, 3), faces (f, 3), f > 0, not {vertices.shape} and {faces.shape}")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError(f"faces must name vertices 0 to {len(vertices) - 1}, not {faces.min()} to {faces.max()}")
+        if np.shape(labels) != (len(faces),):
+            raise ValueError(f"labels must have shape ({len(faces)},), not {np.shape(labels)}")
+        mesh = wp.Mesh(
+            points=wp.array(vertices, dtype=wp.vec3, device=self.device),
+            indices=wp.array(faces.ravel(), dtype=wp.int32, device=self.device),
+        )
+        return mesh, np.stack([vertices.min(0), vertices.max(0)])
+
+    def instances(self, mesh: np.ndarray, transforms: np.ndarray) -> dict[str, np.ndarray]:
+        """What the ray caster needs to know of instances, as host arrays.
+
+        Args:
+            mesh: Number of each instance's mesh, shape (k,).
+            transforms: World from local, affine (turned, scaled, moved), shape (k, 4, 4).
+        """
+        bounds = np.array([self._bounds[m] for m in mesh], np.float64).reshape(-1, 2, 3)
+        centre, half = bounds.mean(1), 0.5 * (bounds[:, 1] - bounds[:, 0])
+        world = np.einsum("kij,kj->ki", transforms[:, :3, :3], centre) + transforms[:, :3, 3]
+        reach = np.einsum("kij,kj->ki", np.abs(transforms[:, :3, :3]), half) + 1e-3
+        inverse = np.linalg.inv(transforms)[:, :3]
+        return {
+            "lower": (world - reach).astype(np.float32),
+            "upper": (world + reach).astype(np.float32),
+            "rows": inverse.astype(np.float32),
+            "mesh": np.array([self._meshes[m].id for m in mesh], np.uint64),
+            "first_face": np.array([self._first_face[m] for m in mesh], np.int32),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarCast:
+    """A plan: casts the beams of one LiDAR sweep into a scene and makes points of the echoes.
+
+    `place` takes the scene of the next sweeps from the host; `launch` allocates nothing and reads nothing back.
+    """
+
+    meshes: MeshSet
+    """The meshes that instances may have."""
+    beams: Any
+    """Unit directions in the sensor's frame, in the order of firing; NumPy, shape (n, 3)."""
+    ring: Any
+    """Laser of each beam, NumPy, shape (n,), uint16."""
+    time: Any
+    """Time of each beam after the start of the sweep [s], NumPy, shape (n,)."""
+    period: float = 0.1
+    """Duration of a sweep [s]."""
+    max_instances: int = 4096
+    """Instances that a scene can have."""
+    min_range: float = 0.9
+    """No echo comes from nearer [m]."""
+    max_range: float = 120.0
+    """No echo comes from farther [m]."""
+    reach: float = 60.0
+    """Where a Lambertian target of 10 % reflectivity, face on, is seen half of the time [m]."""
+    range_noise: float = 0.015
+    """Standard deviation of a range [m]."""
+    drop_out: float = 0.01
+    """Share of the echoes that are lost for no reason."""
+
+    def __post_init__(self):
+        device, n = self.meshes.device, len(self.beams)
+        if n == 0 or len(self.ring) != n or len(self.time) != n:
+            raise ValueError(
+                f"beams, ring and time must have one length > 0, not {n}, {len(self.ring)}, {len(self.time)}"
+            )
+
+        def hold(name: str, array: wp.array) -> None:
+            object.__setattr__(self, name, array)
+
+        def upload(values: Any, dtype: type, numpy_type: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values, numpy_type), dtype=dtype, device=device)
+
+        time = np.asarray(self.time, np.float32)
+        hold("_beams", upload(self.beams, wp.vec3, np.float32))
+        hold("_ring", upload(self.ring, wp.uint16, np.uint16))
+        hold("_time", upload(time, wp.float32, np.float32))
+        hold("_fraction", upload(time / self.period, wp.float32, np.float32))
+        hold("_pose", wp.zeros(2, dtype=wp.transform, device=device))
+        hold("_seed", wp.zeros(1, dtype=wp.uint32, device=device))
+        hold("_material", wp.zeros((MATERIALS, 4), dtype=wp.float32, device=device))
+        hold("_scene", [])
+        hold("_mesh", wp.zeros(self.max_instances, dtype=wp.uint64, device=device))
+        hold("_first_face", wp.zeros(self.max_instances, dtype=wp.int32, device=device))
+        hold("_rows", wp.zeros((self.max_instances, 3), dtype=wp.vec4, device=device))
+        for name, dtype in (
+            ("distance", wp.float32), ("hit_instance", wp.int32), ("hit_face", wp.int32), ("hit_label", wp.int32),
+            ("hit_normal", wp.vec3), ("_kept", wp.int32), ("_rank", wp.int32), ("_range", wp.float32),
+            ("_intensity", wp.float32), ("points", wp.vec4), ("point_ring", wp.uint16), ("point_time", wp.float32),
+            ("point_class", wp.int32), ("point_instance", wp.int32),
+        ):  # fmt: skip
+            hold(name, wp.zeros(n, dtype=dtype, device=device))
+        hold("count", wp.zeros(1, dtype=wp.int32, device=device))
+
+    def set_materials(self, table: np.ndarray) -> None:
+        """Sets reflectivity, porosity, loss and gloss of each material, all in [0, 1]; shape (256, 4)."""
+        if np.shape(table) != (MATERIALS, 4):
+            raise ValueError(f"table must have shape ({MATERIALS}, 4), not {np.shape(table)}")
+        self._material.assign(np.ascontiguousarray(table, np.float32))
+
+    def place(self, mesh: np.ndarray, transforms: np.ndarray) -> None:
+        """Sets the instances of the scene.
+
+        Args:
+            mesh: Number of each instance's mesh in `meshes`, shape (k,).
+            transforms: World from local, affine, shape (k, 4, 4).
+
+        Raises:
+            ValueError: There are none, or more than `max_instances`.
+        """
+        k = len(mesh)
+        if not 0 < k <= self.max_instances or np.shape(transforms) != (k, 4, 4):
+            raise ValueError(
+                f"mesh must name 1 to {self.max_instances} instances and transforms be (k, 4, 4), "
+                f"not {k} and {np.shape(transforms)}"
+            )
+        device = self.meshes.device
+        host = self.meshes.instances(np.asarray(mesh), np.asarray(transforms, np.float64))
+        lower = wp.array(host["lower"], dtype=wp.vec3, device=device)
+        upper = wp.array(host["upper"], dtype=wp.vec3, device=device)
+        self._scene[:] = [wp.Bvh(lower, upper), lower, upper]
+        wp.copy(self._mesh, wp.array(host["mesh"], dtype=wp.uint64, device=device), count=k)
+        wp.copy(self._first_face, wp.array(host["first_face"], dtype=wp.int32, device=device), count=k)
+        wp.copy(self._rows, wp.array(host["rows"].reshape(k, 3, 4), dtype=wp.vec4, device=device), count=3 * k)
+
+    def aim(self, start: np.ndarray, end: np.ndarray | None = None, seed: int = 0) -> None:
+        """Sets the sensor's pose at start and end of the sweep, and the seed of its noise.
+
+        Args:
+            start: World from sensor, rigid, shape (4, 4).
+            end: The same one period later; None for a sensor at rest.
+            seed: Any integer.
+        """
+        rows = []
+        for pose in (start, start if end is None else end):
+            quaternion = wp.quat_from_matrix(wp.mat33(*np.asarray(pose, np.float64)[:3, :3].ravel()))
+            rows.append([*np.asarray(pose)[:3, 3], *quaternion])
+        self._pose.assign(np.array(rows, np.float32))
+        self._seed.assign(np.array([seed & 0xFFFFFFFF], np.uint32))
+
+    def launch(self) -> None:
+        """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`."""
+        device, n = self.meshes.device, self._beams.shape[0]
+        scene = self._scene[0].id
+        wp.launch(
+            _cast,
+            dim=n,
+            inputs=[
+                self._beams, self._fraction, self._pose, self.max_range, self._seed, scene, self._mesh,
+                self._first_face, self._rows, self.meshes.labels, self._material,
+            ],
+            outputs=[self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],
+            device=device,
+        )  # fmt: skip
+        wp.launch(
+            _sense,
+            dim=n,
+            inputs=[
+                self._beams, self._fraction, self._pose, self.distance, self.hit_label, self.hit_normal,
+                self._material, self._seed, self.min_range, self.reach, self.range_noise, self.drop_out,
+            ],
+            outputs=[self._kept, self._range, self._intensity],
+            device=device,
+        )  # fmt: skip
+        wp.utils.array_scan(self._kept, self._rank, inclusive=False)
+        wp.launch(
+            _compact,
+            dim=n,
+            inputs=[
+                self._beams, self._kept, self._rank, self._range, self._intensity, self.hit_label,
+                self.hit_instance, self._ring, self._time,
+            ],
+            outputs=[
+                self.points, self.point_ring, self.point_time, self.point_class, self.point_instance, self.count,
+            ],
+            device=device,
+        )  # fmt: skip
+
+
+@wp.kernel
+def _first_hit(
+    # in
+    mesh: wp.uint64,
+    origins_in: wp.array(dtype=wp.vec3),
+    directions_in: wp.array(dtype=wp.vec3),
+    max_distance: float,
+    # out
+    distance_out: wp.array(dtype=wp.float32),
+    face_out: wp.array(dtype=wp.int32),
+    normal_out: wp.array(dtype=wp.vec3),
+):
+    i = wp.tid()
+    direction = wp.normalize(directions_in[i])
+    hit = wp.mesh_query_ray(mesh, origins_in[i], direction, max_distance)
+    if hit.result:
+        distance_out[i] = hit.t
+        face_out[i] = hit.face
+        normal_out[i] = hit.normal
+    else:
+        distance_out[i] = wp.inf
+        face_out[i] = _NO_HIT
+        normal_out[i] = wp.vec3(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """What n rays hit, as arrays of the rays' own family."""
+
+    distance: Any
+    """Along the ray [m], inf where it hits nothing; shape (n,), float32."""
+    face: Any
+    """The face hit, −1 where none is; shape (n,), int32."""
+    normal: Any
+    """Of the face hit, zero where none is; shape (n, 3), float32."""
+
+
+def raycast(vertices: Any, faces: Any, origins: Any, directions: Any, *, max_distance: float = 1.0e6) -> RayHits:
+    """The first triangle that each ray hits.
+
+    Args:
+        vertices: Of the mesh [m], shape (v, 3).
+        faces: Corners of each triangle, integers, shape (f, 3).
+        origins: Of the rays [m], shape (n, 3).
+        directions: Of the rays, of any length but zero, shape (n, 3).
+        max_distance: Hits beyond are none [m].
+
+    Raises:
+        TypeError: Not arrays, or faces not of an integer type.
+        ValueError: Other shapes, or lengths that differ.
+    """
+    family = family_of(origins, "origins")
+    points, keep_points = borrow(vertices, wp.float32, (None, 3), "vertices")
+    corners, keep_corners = borrow(faces, wp.int32, (None, 3), "faces")
+    starts, keep_starts = borrow(origins, wp.float32, (None, 3), "origins")
+    along, keep_along = borrow(directions, wp.float32, (None, 3), "directions")
+    n = starts.shape[0]
+    if along.shape[0] != n:
+        raise ValueError(f"directions must be as many as origins, {n}, not {along.shape[0]}")
+    if not corners.shape[0]:
+        raise ValueError("faces must have at least one triangle")
+    if not max_distance > 0:
+        raise ValueError(f"max_distance must be > 0 m, not {max_distance}")
+    device = starts.device
+    distance = wp.empty(n, dtype=wp.float32, device=device)
+    face = wp.empty(n, dtype=wp.int32, device=device)
+    normal = wp.empty(n, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(points=points.view(wp.vec3).flatten(), indices=corners.flatten())
+    if n:
+        wp.launch(
+            _first_hit,
+            dim=n,
+            inputs=[mesh.id, starts.view(wp.vec3).flatten(), along.view(wp.vec3).flatten(), float(max_distance)],
+            outputs=[distance, face, normal],
+            device=device,
+        )
+    hits = RayHits(give(distance, family), give(face, family), give(normal, family))
+    del keep_points, keep_corners, keep_starts, keep_along
+    return hits

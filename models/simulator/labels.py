@@ -1,0 +1,109 @@
+"""What the simulated world is made of: classes of points and materials of faces."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+__all__ = ["GROUND_CLASSES", "Material", "PointClass", "face_label", "material_table"]
+
+
+class PointClass(IntEnum):
+    """The class of a simulated point; finer than the classes of objects."""
+
+    ROAD = 0
+    SIDEWALK = 1
+    TERRAIN = 2
+    BUILDING = 3
+    VEGETATION = 4
+    POLE = 5
+    FENCE = 6
+    VEHICLE = 7
+    PEDESTRIAN = 8
+    CYCLIST = 9
+    CONE = 10
+    BARRIER = 11
+    OTHER = 12
+
+
+GROUND_CLASSES = (PointClass.ROAD, PointClass.SIDEWALK, PointClass.TERRAIN)
+
+
+class Material(IntEnum):
+    """What a face is made of, as far as a laser of 905 nm can tell."""
+
+    ASPHALT = 0
+    MARKING = 1
+    PAVING = 2
+    GRASS = 3
+    BRICK = 4
+    PLASTER = 5
+    CONCRETE = 6
+    WOOD = 7
+    WINDOW = 8
+    DARK_PAINT = 9
+    PAINT = 10
+    BRIGHT_PAINT = 11
+    GLASS = 12
+    TYRE = 13
+    LAMP = 14
+    PLATE = 15
+    INTERIOR = 16
+    BARK = 17
+    LEAVES = 18
+    METAL = 19
+    SIGN = 20
+    CLOTH = 21
+    DARK_CLOTH = 22
+    SKIN = 23
+    SPOKES = 24
+    MESH = 25
+    PLASTIC = 26
+    SOIL = 27
+
+
+# reflectivity, porosity (share of beams that pass), loss (share of echoes that are lost), gloss
+_PROPERTIES = {
+    Material.ASPHALT: (0.22, 0.0, 0.01, 0.0),
+    Material.MARKING: (0.75, 0.0, 0.0, 0.0),
+    Material.PAVING: (0.35, 0.0, 0.0, 0.0),
+    Material.GRASS: (0.45, 0.0, 0.01, 0.0),
+    Material.BRICK: (0.35, 0.0, 0.0, 0.0),
+    Material.PLASTER: (0.55, 0.0, 0.0, 0.0),
+    Material.CONCRETE: (0.4, 0.0, 0.0, 0.0),
+    Material.WOOD: (0.4, 0.0, 0.0, 0.0),
+    Material.WINDOW: (0.2, 0.55, 0.35, 0.6),
+    Material.DARK_PAINT: (0.12, 0.0, 0.04, 0.3),
+    Material.PAINT: (0.35, 0.0, 0.02, 0.3),
+    Material.BRIGHT_PAINT: (0.65, 0.0, 0.01, 0.3),
+    Material.GLASS: (0.15, 0.72, 0.55, 0.6),
+    Material.TYRE: (0.08, 0.0, 0.05, 0.0),
+    Material.LAMP: (0.9, 0.0, 0.0, 0.0),
+    Material.PLATE: (1.0, 0.0, 0.0, 0.0),
+    Material.INTERIOR: (0.18, 0.0, 0.1, 0.0),
+    Material.BARK: (0.25, 0.0, 0.0, 0.0),
+    Material.LEAVES: (0.45, 0.15, 0.05, 0.0),
+    Material.METAL: (0.4, 0.0, 0.0, 0.2),
+    Material.SIGN: (1.0, 0.0, 0.0, 0.0),
+    Material.CLOTH: (0.4, 0.0, 0.01, 0.0),
+    Material.DARK_CLOTH: (0.15, 0.0, 0.02, 0.0),
+    Material.SKIN: (0.5, 0.0, 0.0, 0.0),
+    Material.SPOKES: (0.3, 0.85, 0.2, 0.0),
+    Material.MESH: (0.35, 0.8, 0.1, 0.0),
+    Material.PLASTIC: (0.5, 0.0, 0.0, 0.1),
+    Material.SOIL: (0.3, 0.0, 0.01, 0.0),
+}
+
+
+def material_table() -> np.ndarray:
+    """Reflectivity, porosity, loss and gloss of each material, as the ray caster takes them; shape (256, 4)."""
+    table = np.zeros((256, 4), np.float32)
+    for material, row in _PROPERTIES.items():
+        table[material] = row
+    return table
+
+
+def face_label(material: Material, point_class: PointClass) -> int:
+    """The label of a face: its material and the class of its points."""
+    return int(material) + 256 * int(point_class)
