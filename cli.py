@@ -27,7 +27,9 @@ Profile = Annotated[str, typer.Option("--profile", help="Hardware profile: a nam
 Device = Annotated[str | None, typer.Option("--device", help="Compute device in place of the profile's: cpu, cuda:0 …")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting by its dotted key, such as perception.cluster.radius=0.6."),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Change a setting by its dotted key, such as perception.cluster.radius=0.6."
+    ),
 ]
 
 
@@ -62,13 +64,19 @@ def demo(
 
 @app.command()
 def run(
-    source: Annotated[str, typer.Option("--source", help="kitti:DIR, sim:street?seed=7, or a scan or a folder of scans.")],
+    source: Annotated[
+        str, typer.Option("--source", help="kitti:DIR, sim:street?seed=7, or a scan or a folder of scans.")
+    ],
     profile: Profile = "cpu",
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for objects.jsonl, report.json and run.mcap.")] = Path("warploom-out"),
+    out: Annotated[Path, typer.Option(help="Folder for objects.jsonl, report.json and run.mcap.")] = Path(
+        "warploom-out"
+    ),
     device: Device = None,
     settings: Settings = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Feed frames at their own pace; late ones are dropped.")] = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Feed frames at their own pace; late ones are dropped.")
+    ] = False,
     mcap: Annotated[bool, typer.Option(help="Write run.mcap.")] = True,
 ) -> None:
     """Perceive the frames of a recording or of the simulator.
