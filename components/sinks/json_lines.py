@@ -1,9 +1,9 @@
 """Obstacles as JSON lines: `objects.jsonl`, a line a frame.
 
 A line has, in this order: `version` [ns], `frame`, `objects`, `missing_inputs`, `frame_id`, `velocity_reference`,
-`latency_ms`. An object has `id`, `class` (its name), `score`, `box` [x y z l w h yaw], `velocity` [vx vy] and `kind`, which is
-`foreground` or `background`. Metres, metres per second and milliseconds have three decimals, yaw and score four; a velocity
-that is not known is null. The same obstacles make the same bytes.
+`latency_ms`. An object has `id`, `class` (its name), `score`, `box` [x y z l w h yaw], `velocity` [vx vy] and `kind`,
+which is `foreground` or `background`. Metres, metres per second and milliseconds have three decimals, yaw and score
+four; a velocity that is not known is null. The same obstacles make the same bytes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ObjectsRecord:
 
 
 class JsonLinesSink:
-    """Writes `objects.jsonl`; each line is in the file when `write` returns, so a run that breaks off leaves whole lines."""
+    """Writes `objects.jsonl`; a line is in the file when `write` returns: a run that breaks off leaves whole ones."""
 
     def __init__(self, path: str | os.PathLike):
         """Creates the file, and its folder where there is none; a file of that name is replaced.

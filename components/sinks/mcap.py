@@ -99,9 +99,10 @@ class _File:
 class McapSink:
     """Records obstacles and clouds into an MCAP file, on a thread of its own.
 
-    `write` copies the cloud and returns; the thread encodes, compresses and writes. At most eight frames wait: then
-    `write` waits too (`when_full="block"`, so that nothing of an offline run is lost), or the frame is left out and counted in
-    `dropped` (`when_full="drop"`, so that a slow disk never holds up perception).
+    `write` copies the cloud and returns; the thread encodes, compresses and writes. At most eight frames wait. With
+    `when_full="block"` the ninth waits too, so that nothing of an offline run is lost, and a disk that fails is an
+    error of the next `write`. With `when_full="drop"` it is left out and counted in `dropped`, as is every frame after
+    a disk failed, so that no disk ever holds up perception; `close` tells the failure.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class McapSink:
         self.written = 0
         """Frames that are in the file, or were handed to its writer."""
         self.dropped = 0
-        """Frames that were left out because the thread was behind."""
+        """Frames that were left out because the thread was behind or the disk had failed."""
         self.refused = 0
         """Objects that were left out, as a number of their box was not finite."""
         try:
@@ -158,7 +159,7 @@ class McapSink:
         # Level 1: real scans shrink by a fifth at any level, and more levels cost more time than they save bytes.
         level = 1 if compression == "zstd" else 0
         options = MCAPWriteOptions(compression=kind, compression_level=level, compression_threads=0)
-        context = foxglove.Context()
+        self._context = context = foxglove.Context()  # without it its channels would be closed
         self._writer = foxglove.open_mcap(self._file, context=context, writer_options=options)
         if metadata:
             self._writer.write_metadata("warploom", dict(metadata))
@@ -187,15 +188,16 @@ class McapSink:
             pose: World from sensor, shape (4, 4); None: the sensor is the world.
 
         Raises:
-            SinkError: The sink is closed, or an earlier frame could not be written.
+            SinkError: The sink is closed; with `when_full="block"` also: an earlier frame could not be written.
             ValueError: points is not of that shape.
         """
         if points is not None and (points.ndim != 2 or points.shape[1] != 4):
             raise ValueError(f"points has shape {points.shape}; expected (n, 4): x y z intensity")
         if self._closed:
             raise SinkError(f"{self.path}: closed: nothing more can be written")
-        self._raise_failure()
-        if self._when_full == "drop" and self._queue.full():
+        if self._when_full == "block":
+            self._raise_failure()
+        elif self._queue.full() or self._failure or self._file.error:
             self.dropped += 1
             return
         cloud = None if points is None else np.ascontiguousarray(points, "<f4").tobytes()
@@ -222,7 +224,7 @@ class McapSink:
                 self._failure = error
         self._file.close()
         if self.dropped:
-            _log.warning("%s: %d frames were left out, as writing was too slow", self.path, self.dropped)
+            _log.warning("%s: %d frames were left out, as writing was too slow or failed", self.path, self.dropped)
         self._raise_failure()
 
     def __enter__(self) -> Self:
@@ -274,16 +276,13 @@ class McapSink:
         self._scenes.log(SceneUpdate(deletions=[deletion], entities=entities), log_time=version)
 
 
-def _pose(place: tuple[float, float, float], yaw: float, pitch: float = 0.0):
-    """Foxglove's pose from a place and a heading; the rotation about y comes before that about z."""
+def _pose(place: tuple[float, float, float], yaw: float):
+    """Foxglove's pose from a place and a heading."""
     from foxglove.messages import Pose, Quaternion, Vector3
 
-    (cy, sy), (cp, sp) = (math.cos(yaw / 2), math.sin(yaw / 2)), (math.cos(pitch / 2), math.sin(pitch / 2))
     x, y, z = place
-    return Pose(
-        position=Vector3(x=x, y=y, z=z),
-        orientation=Quaternion(x=-sy * sp, y=cy * sp, z=sy * cp, w=cy * cp),
-    )
+    turn = Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
 
 
 def _transform(stamp, frame_id: str, pose: np.ndarray | None):
