@@ -233,9 +233,8 @@ def _mark_heads(
     j = wp.tid()
     head = int(0)
     key = key_in[j]
-    if key < grid.total:
-        if j == 0 or key_in[j - 1] != key:
-            head = 1
+    if key < grid.total and (j == 0 or key_in[j - 1] != key):
+        head = 1
     head_out[j] = head
     if head == 1:
         first_out[point_in[j]] = 1
