@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
 
 __all__ = ["LossCounters"]
+
+_log = logging.getLogger(__name__)
 
 OnLoss = Callable[[str, str, int], None]
 
@@ -32,7 +35,10 @@ class LossCounters:
             self._counts[place, reason] += amount
             callbacks = tuple(self._callbacks)
         for callback in callbacks:
-            callback(place, reason, version)
+            try:
+                callback(place, reason, version)
+            except Exception:  # who watches losses must not cause more of them
+                _log.exception("a callback on losses failed")
 
     def on_loss(self, callback: OnLoss) -> None:
         """Calls `callback(place, reason, version)` at every loss from now on, in the thread that lost it."""

@@ -9,6 +9,7 @@ The declarations are the component's interface; the runtime binds each to the wi
 
 from __future__ import annotations
 
+import operator
 import time
 from types import TracebackType
 from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
@@ -57,11 +58,13 @@ class Change(Generic[T]):
         """Sets the version [ns], and when the sensor's data was received, if that was not just now.
 
         Raises:
+            TypeError: The version is not a whole number.
             ValueError: The version is negative or does not fit in 64 bits.
         """
+        version = operator.index(version)
         if not 0 <= version < 1 << 64:
             raise ValueError(f"version must be an unsigned 64-bit number of nanoseconds, not {version}")
-        self._version = int(version)
+        self._version = version
         self._received_ns = received_ns
 
     @property

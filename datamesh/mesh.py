@@ -35,7 +35,7 @@ class DataMesh:
         with self._lock:
             window = self._windows.get(topic)
             if window is None:
-                window = Window(topic, capacity or self._window_capacity, self.losses)
+                window = Window(topic, self._window_capacity if capacity is None else capacity, self.losses)
                 self._windows[topic] = window
             return window
 

@@ -21,7 +21,8 @@ __all__ = ["CommitPolicy", "Entry", "Miss", "Snapshot", "Window"]
 
 T = TypeVar("T")
 
-_SETTLED_KEPT = 1024
+_REMEMBERED = 1024
+"""How many settled and how many evicted versions a window knows one by one."""
 
 
 class CommitPolicy(IntEnum):
@@ -91,13 +92,24 @@ class Snapshot(Generic[T]):
         return len(self._state.entries)
 
     def __getitem__(self, index: int) -> T:
-        return self._state.entries[index].value
+        """The datum at an index.
+
+        Raises:
+            IndexError: There is none; −1 is what the searches give on a miss, and never the newest.
+        """
+        return self.entry(index).value
 
     def __iter__(self) -> Iterator[T]:
         return (entry.value for entry in self._state.entries)
 
     def entry(self, index: int) -> Entry[T]:
-        """The datum with its version and times."""
+        """The datum at an index, with its version and times.
+
+        Raises:
+            IndexError: There is none.
+        """
+        if index < 0:
+            raise IndexError(f"snapshot index {index}: the version looked for is not there; `last()` gives the newest")
         return self._state.entries[index]
 
     def version_index(self, version: int) -> int:
@@ -155,7 +167,7 @@ class Window(Generic[T]):
         Args:
             topic: Its name, for messages and counters.
             capacity: How many versions it keeps, ≥ 1; a further one evicts the lowest.
-            losses: Where discarded and evicted data are counted.
+            losses: Where discarded data are counted.
 
         Raises:
             ValueError: `capacity` is below 1.
@@ -166,7 +178,10 @@ class Window(Generic[T]):
         self.capacity = capacity
         self.losses = losses if losses is not None else LossCounters()
         self._state: _State[T] = _State()
+        self._evicted: dict[int, None] = {}
         self._lock = threading.Lock()
+        # Held from a commit to the end of its callbacks: subscribers see the commits in their order.
+        self._commit_lock = threading.RLock()
         self._on_commit: list[Callable[[Entry[T]], None]] = []
         self._on_settle: list[Callable[[int], None]] = []
 
@@ -188,24 +203,26 @@ class Window(Generic[T]):
         Returns:
             OK, OUT_OF_ORDER or DUPLICATE; the latter two are counted.
         """
-        with self._lock:
-            state = self._state
-            index = bisect_left(state.versions, entry.version)
-            newest = index == len(state.versions)
-            if not newest and state.versions[index] == entry.version:
-                status = Status.DUPLICATE
-            elif (not newest and policy is CommitPolicy.DISCARD_OUT_OF_ORDER) or entry.version <= state.evicted:
-                status = Status.OUT_OF_ORDER
-            else:
-                status = Status.OK
-                freeze(entry.value)
-                self._insert(state, index, entry)
-        if status:
-            self.losses.count(self.topic, status.name.lower(), entry.version)
-        elif newest:
-            for on_commit in self._on_commit:
-                on_commit(entry)
-        return status
+        with self._commit_lock:
+            with self._lock:
+                state = self._state
+                index = bisect_left(state.versions, entry.version)
+                newest = index == len(state.versions)
+                evicts_itself = index == 0 and len(state.versions) == self.capacity
+                if not newest and state.versions[index] == entry.version:
+                    status = Status.DUPLICATE
+                elif not newest and (policy is CommitPolicy.DISCARD_OUT_OF_ORDER or evicts_itself):
+                    status = Status.OUT_OF_ORDER
+                else:
+                    status = Status.OK
+                    freeze(entry.value)
+                    self._insert(state, index, entry)
+            if status:
+                self.losses.count(self.topic, status.name.lower(), entry.version)
+            elif newest:
+                for on_commit in self._on_commit:
+                    on_commit(entry)
+            return status
 
     def _insert(self, state: _State[T], index: int, entry: Entry[T]) -> None:
         versions = (*state.versions[:index], entry.version, *state.versions[index:])
@@ -214,17 +231,20 @@ class Window(Generic[T]):
         if len(versions) > self.capacity:
             evicted = versions[0]
             versions, entries = versions[1:], entries[1:]
-        self._state = _State(state.epoch, versions, entries, evicted, state.settled)
+            _remember(self._evicted, evicted)
+        settled = state.settled
+        if entry.version in settled:
+            settled = {version: None for version in settled if version != entry.version}
+        self._state = _State(state.epoch, versions, entries, evicted, settled)
 
     def settle(self, version: int) -> None:
-        """Says that there will be nothing at `version` and tells the subscribers, unless there is something."""
+        """Says that there will be nothing at `version` and tells the subscribers, unless there is or was something."""
         with self._lock:
             state = self._state
-            if version in state.settled or version in state.versions:
+            if version in state.settled or version in state.versions or version in self._evicted:
                 return
-            settled = {**state.settled, version: None}
-            while len(settled) > _SETTLED_KEPT:
-                del settled[next(iter(settled))]
+            settled = dict(state.settled)
+            _remember(settled, version)
             self._state = _State(state.epoch, state.versions, state.entries, state.evicted, settled)
         for on_settle in self._on_settle:
             on_settle(version)
@@ -232,5 +252,13 @@ class Window(Generic[T]):
     def new_epoch(self) -> int:
         """Starts over, empty, in the next epoch: versions may begin anew. Gives the epoch."""
         with self._lock:
+            self._evicted.clear()
             self._state = _State(epoch=self._state.epoch + 1)
             return self._state.epoch
+
+
+def _remember(versions: dict[int, None], version: int) -> None:
+    """Adds a version to a bounded memory of versions, which forgets its oldest."""
+    versions[version] = None
+    if len(versions) > _REMEMBERED:
+        del versions[next(iter(versions))]
