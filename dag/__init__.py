@@ -1,5 +1,6 @@
 """The component runtime: graph engine, processors, component kinds, module files, and the process that runs them."""
 
+from ..datamesh import Status
 from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
 from .configuration import ConfigFile, find_config, import_class, nearest, parse_overrides
@@ -30,6 +31,7 @@ __all__ = [
     "ProcessorConfig",
     "ProcessorHarness",
     "Run",
+    "Status",
     "Trigger",
     "Vertex",
     "VertexSpec",

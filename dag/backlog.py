@@ -66,8 +66,9 @@ class Backlog:
             if dropped is not trigger:
                 self._waiting.append(trigger)
                 self._changed.notify_all()
+            reason = "shutdown" if self._closed else "backlog"
         if dropped is not None:
-            self._losses.count(self._place, "shutdown" if self._closed else "backlog", dropped.version)
+            self._losses.count(self._place, reason, dropped.version)
         return dropped
 
     def _full(self) -> bool:

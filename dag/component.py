@@ -44,12 +44,9 @@ class Component:
         self.inputs: dict[str, Input] = {}
         self.outputs: dict[str, Output] = {}
         for handle_name, handle in declared_handles(type(self)).items():
-            self._add_handle(handle_name, handle)
+            (self.inputs if isinstance(handle, Input) else self.outputs)[handle_name] = handle  # type: ignore[assignment]
+            setattr(self, handle_name, handle)
         self.losses = LossCounters()
-
-    def _add_handle(self, name: str, handle: Input | Output) -> None:
-        (self.inputs if isinstance(handle, Input) else self.outputs)[name] = handle  # type: ignore[assignment]
-        setattr(self, name, handle)
 
     def bind(self, mesh: DataMesh, topics: Mapping[str, str]) -> None:
         """Connects the handles to their topics in the mesh."""
@@ -156,7 +153,7 @@ class DataProcessComponent(Component):
     def _run(self, trigger: Trigger) -> None:
         try:
             self.process(trigger)
-        except Exception:
+        except BaseException:  # also SystemExit: only the process as a whole may end the thread
             _log.exception("%s failed at version %d", self.name, trigger.version)
             self.losses.count(self.name, "failed", trigger.version)
         self.settle(trigger.version)
@@ -178,9 +175,9 @@ class DagComponent(DataProcessComponent):
     def add_handles(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Adds the inputs and outputs that the configuration names; the class need not declare them."""
         for name in inputs:
-            self._add_handle(name, self.inputs.get(name) or Input())
+            self.inputs.setdefault(name, Input())
         for name in outputs:
-            self._add_handle(name, self.outputs.get(name) or Output())
+            self.outputs.setdefault(name, Output())
 
     def set_graph(
         self,
@@ -213,28 +210,46 @@ class DagComponent(DataProcessComponent):
         if self._engine is not None:
             self._engine.stop()
         for vertex in self._vertices:
-            vertex.processor.close()
+            try:
+                vertex.processor.close()
+            except Exception:
+                _log.exception("%s.%s failed to close", self.name, vertex.name)
 
-    def _run(self, trigger: Trigger) -> None:
+    def _serve(self) -> None:
+        assert self._backlog is not None
+        while True:
+            # The slot comes first: while none is free, triggers wait in the backlog, where its policy rules.
+            self._slots.acquire()
+            trigger = self._backlog.take()
+            if trigger is None or trigger.settled or not self._submit(trigger):
+                self._slots.release()
+            if trigger is None:
+                return
+            if trigger.settled:
+                self.settle(trigger.version)
+
+    def _submit(self, trigger: Trigger) -> bool:
+        """Starts the graph for a trigger, or settles it; tells whether it started."""
         assert self._engine is not None
         assert self.trigger_input is not None
-        self._slots.acquire()
         with self.inputs[self.trigger_input].access() as snapshot:
             index = snapshot.version_index(trigger.version)
             if index < 0:
                 miss = snapshot.miss(trigger.version)
                 self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
-                self._slots.release()
                 self.settle(trigger.version)
-                return
+                return False
             data = {self.trigger_input: snapshot[index]}
         self._engine.submit(trigger, data, self._done)
+        return True
 
     def _done(self, run: Run) -> None:
         if run.error is not None:
             self.losses.count(f"{self.name}.{run.failed_vertex}", "failed", run.trigger.version)
-        self.settle(run.trigger.version)
-        self._slots.release()
+        try:
+            self.settle(run.trigger.version)
+        finally:
+            self._slots.release()
 
 
 class MonotonicDagComponent(DagComponent):
@@ -246,10 +261,10 @@ class MonotonicDagComponent(DagComponent):
         super().__init__(name, context)
         self._last_started = -1
 
-    def _run(self, trigger: Trigger) -> None:
+    def _submit(self, trigger: Trigger) -> bool:
         if trigger.version <= self._last_started:
             self.losses.count(self.name, "out_of_order", trigger.version)
             self.settle(trigger.version)
-            return
+            return False
         self._last_started = trigger.version
-        super()._run(trigger)
+        return super()._submit(trigger)

@@ -7,7 +7,7 @@ import importlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -29,18 +29,21 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"{hint}known: {', '.join(known) or 'none'}"
 
 
-def _unique_keys(node: yaml.Node | None, path: Path) -> None:
+def _unique_keys(node: yaml.Node | None, path: Path, visited: set[int]) -> None:
     """Refuses a key that stands twice in one mapping, which YAML would resolve in silence."""
+    if id(node) in visited:  # an alias
+        return
+    visited.add(id(node))
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, value in node.value:
             if key.value in seen:
                 raise ConfigError(f"{path}:{key.start_mark.line + 1}: key {key.value!r} stands twice in one mapping")
             seen.add(key.value)
-            _unique_keys(value, path)
+            _unique_keys(value, path, visited)
     elif isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _unique_keys(item, path)
+            _unique_keys(item, path, visited)
 
 
 class ConfigFile(Generic[M]):
@@ -75,9 +78,10 @@ class ConfigFile(Generic[M]):
             where = f":{mark.line + 1}" if mark is not None else ""
             problem = getattr(error, "problem", None) or str(error)
             raise ConfigError(f"{self.path}{where}: is not YAML: {problem}") from error
-        _unique_keys(self._root, self.path)
+        _unique_keys(self._root, self.path, set())
         if not isinstance(data, dict):
             raise ConfigError(f"{self.path}:1: expected a mapping of keys to values, found {type(data).__name__}")
+        self._changes = tuple(changes or {})
         for keys, value in (changes or {}).items():
             override(data, keys, value)
         try:
@@ -121,21 +125,28 @@ class ConfigFile(Generic[M]):
         for problem in error.errors():
             keys = [*prefix, *(key for key in problem["loc"] if key != "[key]")]
             where = f"{self.path}:{self.line(keys)}: {'.'.join(map(str, keys)) or 'file'}"
+            if any(tuple(keys[: len(change)]) == change for change in self._changes):
+                where += " (as set from outside the file)"
             if problem["type"] == "extra_forbidden":
                 known = _known_keys(model, problem["loc"][:-1])
                 lines.append(f"{where}: unknown key; {nearest(str(keys[-1]), known)}")
             elif problem["type"] == "missing":
                 lines.append(f"{where}: this key is missing")
             else:
-                lines.append(f"{where}: {problem['msg']}, found {problem['input']!r}")
+                expected = problem["msg"].removeprefix("Value error, ")
+                found = problem["input"]
+                found = type(found).__name__ if isinstance(found, (dict, list)) else repr(found)
+                lines.append(f"{where}: {expected}" + (f", found {found}" if problem["type"] != "value_error" else ""))
         return lines
 
 
 def _known_keys(model: Any, keys: Sequence[str | int]) -> list[str]:
     """The keys that a model takes at a place within it."""
     for key in keys:
-        field = _fields(model).get(str(key))
-        model = field if field is not None else model
+        if get_origin(model) in (list, dict):
+            model = get_args(model)[-1]
+        else:
+            model = _fields(model).get(str(key), model)
     return list(_fields(model))
 
 
@@ -150,13 +161,23 @@ def _fields(annotation: Any) -> dict[str, Any]:
 
 
 def override(data: dict[str, Any], keys: Sequence[str | int], value: Any) -> None:
-    """Sets a value deep in mappings and lists, making the mappings on the way."""
+    """Sets a value deep in mappings and lists, making the mappings on the way.
+
+    Raises:
+        ConfigError: A key for a list is not the number of one of its items.
+    """
     place: Any = data
-    for key in keys[:-1]:
-        if isinstance(place, dict) and not isinstance(place.get(key), (dict, list)):
+    for depth, key in enumerate(keys):
+        if isinstance(place, list):
+            if not str(key).isdecimal() or int(key) >= len(place):
+                where = ".".join(map(str, keys[: depth + 1]))
+                raise ConfigError(f"setting {where}: {key!r} is not the number of an item, 0 to {len(place) - 1}")
+            key = int(key)
+        if depth == len(keys) - 1:
+            place[key] = value
+        elif isinstance(place, dict) and not isinstance(place.get(key), (dict, list)):
             place[key] = {}
         place = place[key]
-    place[keys[-1]] = value
 
 
 def parse_overrides(settings: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -227,6 +248,8 @@ def import_class(dotted: str) -> type:
         module = importlib.import_module(module_name)
     except ImportError as error:
         raise ConfigError(f"cannot import {module_name!r}: {error}; is its folder on PYTHONPATH?") from error
+    except Exception as error:
+        raise ConfigError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         classes = [name for name, value in vars(module).items() if isinstance(value, type)]

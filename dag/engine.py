@@ -97,7 +97,12 @@ class GraphEngine:
             vertices: All vertices; their ports are mapped to data.
             workers: Threads, ≥ 1.
             on_timing: Is told of every vertex's run, in the worker's thread.
+
+        Raises:
+            ValueError: There is no vertex.
         """
+        if not vertices:
+            raise ValueError(f"the graph of {name!r} has no vertices: nothing would ever finish a frame")
         self.name = name
         self._vertices = vertices
         self._worker_count = workers
@@ -176,7 +181,15 @@ class GraphEngine:
                         self._offer(successor)
                 self._offer(vertex)
             if done:
-                run.on_done(run)
+                self._tell(run.on_done, run)
+            del vertex, run  # a worker that waits must not keep a frame alive
+
+    def _tell(self, callback: Callable[[Any], None], event: Any) -> None:
+        """Calls back; a worker outlives whatever it calls, or the frames behind it would never end."""
+        try:
+            callback(event)
+        except Exception:
+            _log.exception("%s: a callback failed", self.name)
 
     def _execute(self, vertex: Vertex, run: Run) -> None:
         processor = vertex.processor
@@ -196,7 +209,9 @@ class GraphEngine:
         else:
             try:
                 status = processor.process(run.trigger)
-            except Exception as error:
+                if not isinstance(status, Status):
+                    raise TypeError(f"process of {type(processor).__name__} returned {status!r}, not a Status")
+            except BaseException as error:  # also SystemExit: only the process as a whole may end a worker
                 status = Status.FAILED
                 run.error, run.failed_vertex = error, vertex.name
                 _log.exception("%s.%s failed at version %d", self.name, vertex.name, run.trigger.version)
@@ -209,6 +224,5 @@ class GraphEngine:
         if self._on_timing is not None:
             ready = run.ready_ns.get(vertex, start)
             version = run.trigger.version
-            self._on_timing(
-                VertexTiming(self.name, vertex.name, version, ready, start, time.perf_counter_ns(), Status(status))
-            )
+            timing = VertexTiming(self.name, vertex.name, version, ready, start, time.perf_counter_ns(), status)
+            self._tell(self._on_timing, timing)

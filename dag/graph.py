@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +11,18 @@ from .configuration import ConfigFile, import_class, nearest
 from .engine import Vertex
 from .processor import In, Out, Processor
 from .schema import ComponentSpec, ModuleSpec
+from .sync import CommitDagProcessor
 
-__all__ = ["DeclaredVertex", "check_payloads", "declare_vertices", "draw_mermaid", "draw_text", "vertex_order"]
+__all__ = [
+    "DeclaredVertex",
+    "check_payloads",
+    "declare_vertices",
+    "draw_mermaid",
+    "draw_text",
+    "graph_payloads",
+    "type_name",
+    "vertex_order",
+]
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,12 @@ def declare_vertices(
             producers[datum] = name
     for name, vertex in vertices.items():
         for port, datum in vertex.inputs.items():
+            if datum in component.inputs and datum != component.trigger:
+                raise file.error(
+                    [*keys, "graph", name, "in", port],
+                    f"input {datum!r} is not the trigger {component.trigger!r}, whose data alone the graph is given: "
+                    "a processor reads it through `component_inputs`",
+                )
             if datum not in producers:
                 if vertex.processor.ports[port].optional:
                     continue
@@ -62,14 +79,24 @@ def declare_vertices(
                 if not check_payloads(given, wanted):
                     raise file.error(
                         [*keys, "graph", name, "in", port],
-                        f"{producers[datum]!r} gives {_type_name(given)} as {datum!r}, "
-                        f"but input {port!r} takes {_type_name(wanted)}",
+                        f"{producers[datum]!r} gives {type_name(given)} as {datum!r}, "
+                        f"but input {port!r} takes {type_name(wanted)}",
                     )
     order = vertex_order(vertices.values(), component.inputs)
     if len(order) < len(vertices):
-        stuck = [name for name in vertices if name not in order]
+        stuck = _cycle([vertex for name, vertex in vertices.items() if name not in order])
         raise file.error([*keys, "graph", stuck[0]], f"these vertices wait for each other in a cycle: {stuck}")
     return [declared[name] for name in order]
+
+
+def _cycle(stuck: list[Vertex]) -> list[str]:
+    """Of the vertices that can never run, those in a cycle or between cycles; the others only come after one."""
+    while True:
+        wanted = {datum for vertex in stuck for datum in vertex.inputs.values()}
+        kept = [vertex for vertex in stuck if wanted & set(vertex.outputs.values())]
+        if len(kept) == len(stuck):
+            return [vertex.name for vertex in stuck]
+        stuck = kept
 
 
 def _declare(
@@ -85,7 +112,11 @@ def _declare(
             [*keys, "processor"], f"{spec.processor} is not a Processor: derive it from warploom.dag.Processor"
         )
     config = file.validate([*keys, "config"], processor_class.Config, spec.config)
-    processor = processor_class()
+    try:
+        processor = processor_class()
+    except Exception as error:
+        message = f"{spec.processor} cannot be made: {type(error).__name__}: {error}"
+        raise file.error([*keys, "processor"], message) from error
     processor.name = name
     for direction, port_kind, mapping in (("in", In, spec.inputs), ("out", Out, spec.outputs)):
         ports = [p for p, port in processor.ports.items() if isinstance(port, port_kind)]
@@ -102,17 +133,36 @@ def vertex_order(vertices: Any, inputs: Mapping[str, str] | Sequence[str]) -> li
     vertices = list(vertices)
     produced = {datum for vertex in vertices for datum in vertex.outputs.values()}
     there = set(inputs)
-    order: list[str] = []
+    order: dict[str, None] = {}
     progress = True
     while progress:
         progress = False
         for vertex in vertices:
-            needed = {datum for datum in vertex.inputs.values() if datum in produced or datum in there}
-            if vertex.name not in order and needed <= there:
-                order.append(vertex.name)
+            if vertex.name not in order and all(d in there or d not in produced for d in vertex.inputs.values()):
+                order[vertex.name] = None
                 there.update(vertex.outputs.values())
                 progress = True
-    return order
+    return list(order)
+
+
+def graph_payloads(declared: Sequence[DeclaredVertex]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a graph says about the types of its component's inputs and outputs.
+
+    Returns:
+        Datum → type that the vertices read it as; output → type that is committed to it.
+    """
+    read: dict[str, Any] = {}
+    given: dict[str, Any] = {}
+    committed: dict[str, Any] = {}
+    for one in declared:
+        ports = one.vertex.processor.ports
+        for port, datum in one.vertex.inputs.items():
+            if ports[port].payload not in (object, Any):
+                read.setdefault(datum, ports[port].payload)
+        given.update({datum: ports[port].payload for port, datum in one.vertex.outputs.items()})
+        if isinstance(one.vertex.processor, CommitDagProcessor):
+            committed[one.config.output] = given.get(one.vertex.inputs["value"], object)
+    return read, committed
 
 
 def check_payloads(given: Any, wanted: Any) -> bool:
@@ -122,7 +172,8 @@ def check_payloads(given: Any, wanted: Any) -> bool:
     return object in (given, wanted) or issubclass(given, wanted)
 
 
-def _type_name(payload: Any) -> str:
+def type_name(payload: Any) -> str:
+    """How messages call a payload's type."""
     return payload.__name__ if isinstance(payload, type) else str(payload)
 
 
@@ -155,7 +206,7 @@ def draw_mermaid(module: ModuleSpec) -> str:
     topics: dict[str, None] = {}
     links: list[str] = []
     for component in module.components:
-        box = f"c_{component.name}"
+        box = _node("c", component.name)
         topics.update(dict.fromkeys((*component.inputs.values(), *component.outputs.values())))
         if not component.graph:
             lines.append(f'  {box}["{component.name}"]')
@@ -166,20 +217,25 @@ def draw_mermaid(module: ModuleSpec) -> str:
         edges = _edges(component)
         producers = {datum: name for name, _, given in edges for datum in given}
         for name, _, _ in edges:
-            lines.append(f'    {box}_{name}["{name}"]')
+            lines.append(f'    {_node(box, name)}["{name}"]')
         lines.append("  end")
         for name, read, _ in edges:
             for datum in read:
                 if datum in producers:
-                    links.append(f"  {box}_{producers[datum]} -- {datum} --> {box}_{name}")
+                    links.append(f"  {_node(box, producers[datum])} -- {datum} --> {_node(box, name)}")
                 elif datum in component.inputs:
-                    links.append(f"  {_topic(component.inputs[datum])} --> {box}_{name}")
+                    links.append(f"  {_topic(component.inputs[datum])} --> {_node(box, name)}")
             output = component.graph[name].config.get("output")
             if output in component.outputs:
-                links.append(f"  {box}_{name} --> {_topic(component.outputs[output])}")
+                links.append(f"  {_node(box, name)} --> {_topic(component.outputs[output])}")
     lines += [f'  {_topic(topic)}(["{topic}"])' for topic in topics]
     return "\n".join(lines + links)
 
 
 def _topic(topic: str) -> str:
-    return "t_" + topic.replace("/", "_").replace("-", "_")
+    return _node("t", topic)
+
+
+def _node(prefix: str, name: str) -> str:
+    """A name as Mermaid takes it: letters, digits and underscores."""
+    return prefix + "_" + re.sub(r"\W", "_", name)

@@ -13,7 +13,7 @@ from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
 from .configuration import ConfigFile, import_class, nearest
 from .engine import VertexTiming
-from .graph import DeclaredVertex, check_payloads, declare_vertices
+from .graph import DeclaredVertex, check_payloads, declare_vertices, graph_payloads, type_name
 from .schema import ComponentSpec, ModuleSpec
 
 __all__ = ["Process", "load_module", "module_changes"]
@@ -51,7 +51,7 @@ def module_changes(module: ModuleSpec, changes: Mapping[tuple[str, ...], Any]) -
                 continue
             if keys[1] in component.graph and len(keys) > 2:
                 place: tuple[str, ...] = ("graph", keys[1], "config", *keys[2:])
-            elif keys[1] in ComponentSpec.model_fields:
+            elif keys[1] in {field.alias or name for name, field in ComponentSpec.model_fields.items()}:
                 place = keys[1:]
             elif component.graph:
                 raise ConfigError(
@@ -116,10 +116,21 @@ class Process:
             base = {"data": DataProcessComponent, "dag": DagComponent, "monotonic_dag": MonotonicDagComponent}[
                 spec.kind
             ]
-            component = self._class_of(place, spec, base)(spec.name, context)
+            component = self._made(place, spec, self._class_of(place, spec, base), context)
+        if isinstance(component, DagComponent) != bool(spec.graph):
+            raise file.error([*keys, "kind"], f"{spec.class_name} is a DagComponent: its kind is dag or monotonic_dag")
+        for name in spec.outputs:
+            if name in spec.inputs:
+                raise file.error(
+                    [*keys, "outputs", name], f"there is an input {name!r} too: give the output a name of its own"
+                )
         if isinstance(component, DagComponent):
             component.add_handles(list(spec.inputs), list(spec.outputs))
             vertices = declare_vertices(file, keys, spec)
+            read, committed = graph_payloads(vertices)
+            for payloads, handles in ((read, component.inputs), (committed, component.outputs)):
+                for name, handle in handles.items():
+                    handle.payload = payloads.get(name, object) if handle.payload is object else handle.payload
             for declared in vertices:
                 declared.vertex.processor.context = context
                 declared.vertex.processor.in_flight = spec.in_flight
@@ -151,10 +162,21 @@ class Process:
             raise file.error(["components", index, "class"], f"{spec.class_name} is not a {base.__name__}")
         return found
 
+    @staticmethod
+    def _made(place: _Place, spec: ComponentSpec, component: type, context: Any) -> Component:
+        try:
+            return component(spec.name, context)
+        except Exception as error:
+            message = f"{spec.class_name} cannot be made: {type(error).__name__}: {error}"
+            raise place[0].error(["components", place[1], "class"], message) from error
+
     def _generic(self, place: _Place, spec: ComponentSpec, context: Any) -> Component:
         plain = self._class_of(place, spec, object)
+        if issubclass(plain, DataProcessComponent):
+            keys = ["components", place[1], "kind"]
+            raise place[0].error(keys, f"{spec.class_name} is a DataProcessComponent: its kind is data, or dag")
         if issubclass(plain, Component):
-            return plain(spec.name, context)
+            return self._made(place, spec, plain, context)
         try:
             return GenericComponent(spec.name, plain, spec.config, context)
         except Exception as error:
@@ -183,7 +205,23 @@ class Process:
                 if topic not in producers and not handle.optional:
                     raise file.error(keys, f"nobody produces topic {topic!r}; {nearest(topic, producers)}")
                 if not check_payloads(types.get(topic, object), handle.payload):
-                    raise file.error(keys, f"topic {topic!r} carries {types[topic]}, not {handle.payload}")
+                    raise file.error(
+                        keys, f"topic {topic!r} carries {type_name(types[topic])}, not {type_name(handle.payload)}"
+                    )
+        self._check_triggers(places)
+
+    @staticmethod
+    def _check_triggers(places: Sequence[_Place]) -> None:
+        """No component waits for a trigger that only comes of its own outputs."""
+        specs = [(file, index, file.content.components[index]) for file, index in places]
+        producers = {topic: spec for _, _, spec in specs for topic in spec.outputs.values()}
+        for file, index, spec in specs:
+            chain, at = [spec.name], spec
+            while (at := producers.get(at.inputs.get(at.trigger, ""))) is not None and at.name not in chain:
+                chain.append(at.name)
+            if at is spec:
+                message = f"these components trigger each other in a cycle, so none ever runs: {chain}"
+                raise file.error(["components", index, "trigger"], message)
 
     def _prepare(
         self,
@@ -218,33 +256,58 @@ class Process:
                 on_timing=on_timing,
             )
         if not isinstance(component, GenericComponent):
-            component.init(file.validate([*keys, "config"], component.Config, spec.config))
+            config = file.validate([*keys, "config"], component.Config, spec.config)
+            try:
+                component.init(config)
+            except (ValueError, TypeError, KeyError) as error:
+                raise file.error([*keys, "config"], str(error)) from error
         if isinstance(component, DataProcessComponent):
             backlog = BacklogConfig(policy="block", depth=spec.backlog.depth) if offline else spec.backlog
+            window = component.inputs[spec.trigger].window
+            if backlog.policy != "latest" and backlog.depth + 2 > window.capacity:
+                raise file.error(
+                    [*keys, "backlog", "depth"],
+                    f"{backlog.depth} triggers may wait, but the window of {window.topic!r} keeps {window.capacity} "
+                    f"versions, so they would be evicted; at most {window.capacity - 2}",
+                )
             component.set_trigger(spec.trigger, backlog)
 
     def start(self) -> None:
-        """Starts the components, those that consume before those that produce."""
+        """Starts the components, those that consume before those that produce; all of them, or none."""
         for component in self._consumers_first():
-            component.start()
+            try:
+                component.start()
+            except BaseException:
+                self.stop()
+                raise
             self._started.append(component)
 
     def stop(self) -> None:
         """Stops the components, those that produce first, each after it has finished what waits for it."""
         while self._started:
-            self._started.pop().stop()
+            component = self._started.pop()
+            try:
+                component.stop()
+            except Exception:  # the others must stop all the same
+                _log.exception("%s failed to stop", component.name)
 
     def _consumers_first(self) -> Iterable[Component]:
         order: list[Component] = []
         left = list(self.components.values())
         while left:
-            for component in left:
-                topics = {handle.topic for handle in component.outputs.values()}
-                others = (other for other in left if other is not component)
-                if not any(topics & {handle.topic for handle in other.inputs.values()} for other in others):
-                    break
-            else:
-                component = left[0]  # a cycle through weak inputs: any order does
-            left.remove(component)
-            order.append(component)
+            # Where weak inputs close a cycle, what triggers whom decides; that has no cycle.
+            free = [one for one in left if not _feeds(one, left)] or [one for one in left if not _triggers(one, left)]
+            left.remove(free[0])
+            order.append(free[0])
         return order
+
+
+def _feeds(component: Component, others: Iterable[Component]) -> bool:
+    topics = {handle.topic for handle in component.outputs.values()}
+    return any(handle.topic in topics for one in others if one is not component for handle in one.inputs.values())
+
+
+def _triggers(component: Component, others: Iterable[Component]) -> bool:
+    topics = {handle.topic for handle in component.outputs.values()}
+    triggered = (one for one in others if isinstance(one, DataProcessComponent) and one.trigger_input is not None)
+    return any(one.inputs[one.trigger_input or ""].topic in topics for one in triggered)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from .backlog import BacklogConfig
+from .configuration import nearest
 
 __all__ = ["ComponentSpec", "ModuleSpec", "VertexSpec"]
 
@@ -38,19 +39,27 @@ class ComponentSpec(_Spec):
     """Dotted name of the class; a dag needs none."""
     config: dict[str, Any] = {}
     """What the class takes."""
-    trigger: str = ""
-    """The input whose commits start a run."""
-    backlog: BacklogConfig = BacklogConfig(policy="latest", depth=1, drop="oldest")
     inputs: dict[str, str] = {}
     """Input → topic."""
     outputs: dict[str, str] = {}
     """Output → topic."""
+    trigger: str = Field("", validate_default=True)
+    """The input whose commits start a run."""
+    backlog: BacklogConfig = BacklogConfig(policy="latest", depth=1, drop="oldest")
     workers: int = Field(1, ge=1, le=64)
     """Threads of a dag."""
     in_flight: int = Field(1, ge=1, le=64)
     """Frames that may be in a dag at once."""
     graph: dict[str, VertexSpec] = {}
     """The vertices of a dag, by name."""
+
+    @field_validator("trigger")
+    @classmethod
+    def _is_an_input(cls, trigger: str, info: ValidationInfo) -> str:
+        inputs = info.data.get("inputs")
+        if inputs is not None and info.data.get("kind", "generic") != "generic" and trigger not in inputs:
+            raise ValueError(f"the trigger must be one of the inputs, not {trigger!r}; {nearest(trigger, inputs)}")
+        return trigger
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> ComponentSpec:
@@ -61,10 +70,6 @@ class ComponentSpec(_Spec):
             raise ValueError(f"a component of kind {self.kind} has no graph: make it dag or monotonic_dag")
         if not dag and not self.class_name:
             raise ValueError(f"a component of kind {self.kind} needs a class")
-        if self.kind != "generic" and self.trigger not in self.inputs:
-            raise ValueError(
-                f"trigger must name one of the inputs ({', '.join(self.inputs) or 'none'}), not {self.trigger!r}"
-            )
         return self
 
 
