@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -29,7 +30,6 @@ POINTS_TOPIC = "perception/points"
 """Where the modules commit what they say of each point."""
 
 _FRAMES_AHEAD = 8
-_RESULTS = (OBSTACLES_TOPIC, POINTS_TOPIC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +69,8 @@ class PerceptionFrame:
     latency: Latency
     dropped: Mapping[str, int]
     """Points that were left out, by reason."""
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """What was committed at this version to the further topics that `Pipeline.run` was asked for, by topic."""
     failed: bool = False
     """True where no obstacles came out: a processor raised, or the frame was dropped on the way."""
 
@@ -171,11 +173,14 @@ class Pipeline:
         with self._timings_lock:
             self._timings.setdefault(timing.version, []).append(timing)
 
-    def run(self, source: Iterable[SensorFrame], *, realtime: bool = False) -> Iterator[PerceptionFrame]:
+    def run(
+        self, source: Iterable[SensorFrame], *, topics: Iterable[str] = (), realtime: bool = False
+    ) -> Iterator[PerceptionFrame]:
         """Perceives the frames of a source, in their order.
 
         Args:
             source: Gives frames with rising versions.
+            topics: Further topics of the modules, whose data each frame brings in `data`.
             realtime: Frames are fed at the pace of their versions, and what is too slow drops frames as its backlog
                 says, counted in `losses`. Otherwise nothing is dropped: every frame of the source comes out.
 
@@ -183,14 +188,20 @@ class Pipeline:
             One PerceptionFrame for each frame of the source, in its order.
 
         Raises:
+            ConfigError: No component gives one of the topics.
             SourceError: The source failed; the frames before it have come out.
         """
+        topics = tuple(topics)
+        given = {t for file in self._modules for c in file.content.components for t in c.outputs.values()}
+        for topic in topics:
+            if topic not in given:
+                raise ConfigError(f"no component gives topic {topic!r}; {nearest(topic, given)}")
         ready, self._next = self._next, None
         process = ready[0] if ready is not None and ready[1] is not realtime else self._build(offline=not realtime)
         self._process, self._mesh = process, process.mesh
         with self._timings_lock:
             self._timings.clear()
-        run = _Run(self, process, source, realtime)
+        run = _Run(self, process, source, topics, realtime)
         try:
             yield from run.frames()
         finally:
@@ -221,10 +232,24 @@ class Pipeline:
         self.close()
 
 
+def _find_module(profile: ConfigFile[Profile], name: str) -> Path:
+    """A module file: beside the profile, or wherever configuration lies."""
+    beside = profile.path.parent / name
+    return beside if beside.suffix in (".yaml", ".yml") and beside.is_file() else find_config(name, "modules", CONF)
+
+
 class _Run:
     """One pass over a source: a thread commits its frames, the caller's thread collects what comes of them."""
 
-    def __init__(self, pipeline: Pipeline, process: Process, source: Iterable[SensorFrame], realtime: bool) -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        process: Process,
+        source: Iterable[SensorFrame],
+        topics: tuple[str, ...],
+        realtime: bool,
+    ) -> None:
+        self._topics = dict.fromkeys((OBSTACLES_TOPIC, POINTS_TOPIC, *topics))
         self._pipeline = pipeline
         self._process = process
         self._source = source
@@ -235,7 +260,7 @@ class _Run:
         # A caller who is slow to take frames holds up the source, and nothing piles up.
         self._room = threading.Semaphore(_FRAMES_AHEAD)
         self._stopping = threading.Event()
-        for topic in _RESULTS:
+        for topic in self._topics:
             process.mesh.window(topic).subscribe(
                 lambda entry, topic=topic: self._events.put((topic, entry)),
                 lambda version, topic=topic: self._events.put((topic, version)),
@@ -266,9 +291,8 @@ class _Run:
         if failure is not None:
             raise failure
 
-    @staticmethod
-    def _complete(parts: dict[str, Any]) -> bool:
-        return "sensor" in parts and all(topic in parts for topic in _RESULTS)
+    def _complete(self, parts: dict[str, Any]) -> bool:
+        return "sensor" in parts and all(topic in parts for topic in self._topics)
 
     def _feed(self) -> None:
         """Commits the source's frames; the last event says how it ended."""
@@ -317,6 +341,7 @@ class _Run:
             clusters=labels.clusters,
             latency=Latency(total, stages),
             dropped=labels.dropped,
+            data={topic: parts[topic].value for topic in self._topics if parts[topic] is not None},
             failed=obstacles is None,
         )
 

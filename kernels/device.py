@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 import warp as wp
@@ -16,6 +21,29 @@ DEFAULT_DEVICE = "cpu"
 _start = threading.Lock()
 
 
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
+
+
+@contextmanager
+def _driver_warning_left_out() -> Iterator[None]:
+    """Passes on what native code writes to stderr, less the line by which Warp greets every machine without a GPU."""
+    try:
+        sys.stderr.flush()
+        kept = os.dup(2)
+    except (OSError, AttributeError):  # a process without stderr
+        yield
+        return
+    with tempfile.TemporaryFile() as written:
+        os.dup2(written.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            written.seek(0)
+            os.write(2, b"".join(line for line in written if _NO_DRIVER not in line))
+
+
 @cache
 def _initialise() -> None:
     """Starts Warp without its banner; a second thread waits for the first."""
@@ -23,7 +51,8 @@ def _initialise() -> None:
         wp.config.log_level = wp.LOG_WARNING
         # Nothing here is differentiated: adjoint code would double the time of a cold start.
         wp.config.enable_backward = False
-        wp.init()
+        with _driver_warning_left_out():
+            wp.init()
 
 
 def device_names() -> list[str]:

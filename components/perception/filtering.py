@@ -85,10 +85,11 @@ class FilterProcessor(Processor):
         plan = next(self._plans)
         plan.launch(borrowed.xyz, borrowed.intensity, wp.array([len(points)], dtype=wp.int32, device=plan.device))
         n = int(plan.count.numpy()[0])
+        non_finite, out_of_range, ego = plan.dropped.numpy().tolist()
         dropped = {
-            "non_finite": int(plan.non_finite.numpy()[0]),
-            "out_of_range": int(plan.out_of_range.numpy()[0]),
-            "ego": int(plan.ego.numpy()[0]),
+            "non_finite": non_finite,
+            "out_of_range": out_of_range,
+            "ego": ego,
             "over_capacity": offered - len(points),
         }
         self.filtered.value = FilteredCloud(sensor, plan.xyz[:n], plan.count, plan.index[:n], dropped)

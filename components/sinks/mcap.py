@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import os
@@ -278,48 +279,49 @@ class McapSink:
 
 def _pose(place: tuple[float, float, float], yaw: float):
     """Foxglove's pose from a place and a heading."""
-    from foxglove.messages import Pose, Quaternion, Vector3
+    import foxglove.messages as fox
 
     x, y, z = place
-    turn = Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn)
+    turn = fox.Quaternion(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+    return fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=turn)
 
 
 def _transform(stamp, frame_id: str, pose: np.ndarray | None):
-    from foxglove.messages import FrameTransform, Quaternion, Vector3
+    import foxglove.messages as fox
     from scipy.spatial.transform import Rotation
 
     T = np.eye(4) if pose is None else pose
     x, y, z, w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True))
-    return FrameTransform(
+    return fox.FrameTransform(
         timestamp=stamp,
         parent_frame_id="world",
         child_frame_id=frame_id,
-        translation=Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
-        rotation=Quaternion(x=x, y=y, z=z, w=w),
+        translation=fox.Vector3(x=float(T[0, 3]), y=float(T[1, 3]), z=float(T[2, 3])),
+        rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
     )
 
 
+@functools.cache
 def _color(name: str, alpha: float) -> Color:
-    from foxglove.messages import Color
+    import foxglove.messages as fox
 
     r, g, b = _COLORS[name]
-    return Color(r=r, g=g, b=b, a=alpha)
+    return fox.Color(r=r, g=g, b=b, a=alpha)
 
 
 def _entity(obstacles: Obstacles, k: int, stamp, latency_ms: float) -> SceneEntity:
     """One obstacle as a cube, its class and id above it, its velocity as an arrow."""
-    from foxglove.messages import ArrowPrimitive, CubePrimitive, KeyValuePair, SceneEntity, TextPrimitive, Vector3
+    import foxglove.messages as fox
 
     x, y, z, length, width, height, yaw = (float(value) for value in obstacles.boxes[k])
     name = CLASSES[int(obstacles.classes[k])]
     background = bool(obstacles.background[k])
-    cube = CubePrimitive(
+    cube = fox.CubePrimitive(
         pose=_pose((x, y, z), yaw),
-        size=Vector3(x=length, y=width, z=height),
+        size=fox.Vector3(x=length, y=width, z=height),
         color=_color(name, 0.25 if background else 0.5),
     )
-    text = TextPrimitive(
+    text = fox.TextPrimitive(
         pose=_pose((x, y, z + height / 2 + 0.4), 0.0),
         billboard=True,
         font_size=12.0,
@@ -332,7 +334,7 @@ def _entity(obstacles: Obstacles, k: int, stamp, latency_ms: float) -> SceneEnti
     arrows = []
     if math.isfinite(speed) and speed > _SLOWEST_ARROW:
         arrows.append(
-            ArrowPrimitive(
+            fox.ArrowPrimitive(
                 pose=_pose((x, y, z), math.atan2(vy, vx)),
                 shaft_length=speed,  # where it is one second later
                 shaft_diameter=0.12,
@@ -350,12 +352,12 @@ def _entity(obstacles: Obstacles, k: int, stamp, latency_ms: float) -> SceneEnti
         "frame": str(obstacles.frame),
         "latency_ms": f"{latency_ms:.3f}",
     }
-    return SceneEntity(
+    return fox.SceneEntity(
         timestamp=stamp,
         frame_id=obstacles.frame_id,
         id=str(int(obstacles.ids[k])),
         frame_locked=True,
-        metadata=[KeyValuePair(key=key, value=value) for key, value in metadata.items()],
+        metadata=[fox.KeyValuePair(key=key, value=value) for key, value in metadata.items()],
         cubes=[cube],
         texts=[] if background else [text],
         arrows=arrows,
