@@ -169,7 +169,7 @@ def check_payloads(given: Any, wanted: Any) -> bool:
     """Whether a payload of type `given` may be read as `wanted`; what is not a class fits everything."""
     if not isinstance(given, type) or not isinstance(wanted, type):
         return True
-    return object in (given, wanted) or issubclass(given, wanted)
+    return object in (given, wanted) or Any in (given, wanted) or issubclass(given, wanted)
 
 
 def type_name(payload: Any) -> str:
