@@ -1,0 +1,311 @@
+"""Filters: takes out of a cloud what no later stage should see, and says how much and why.
+
+What stays keeps its order. A CPU packs the points in one pass; a GPU by a scan over flags, to the same bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import adopt, borrow_points, count_on, give
+from .plan import capacity_for, plan_for
+
+__all__ = ["Filtered", "PointFilter", "filter_points"]
+
+_NON_FINITE, _OUT_OF_RANGE, _EGO, _KEPT = (wp.constant(i) for i in range(4))
+_EVERYWHERE = (-math.inf, -math.inf, -math.inf, math.inf, math.inf, math.inf)
+_NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.struct
+class _Limits:
+    low: wp.vec3
+    high: wp.vec3
+    ego_low: wp.vec3
+    ego_high: wp.vec3
+
+
+@wp.func
+def _inside(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
+    return p[0] >= low[0] and p[1] >= low[1] and p[2] >= low[2] and p[0] < high[0] and p[1] < high[1] and p[2] < high[2]
+
+
+@wp.func
+def _verdict(p: wp.vec3, limits: _Limits) -> int:
+    """The reason why a point goes, the first that holds, or that it stays."""
+    if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2])):
+        return _NON_FINITE
+    if not _inside(p, limits.low, limits.high):
+        return _OUT_OF_RANGE
+    if _inside(p, limits.ego_low, limits.ego_high):
+        return _EGO
+    return _KEPT
+
+
+@wp.kernel
+def _pack_in_order(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    intensity_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    limits: _Limits,
+    # out
+    xyz_out: wp.array(dtype=wp.vec3),
+    intensity_out: wp.array(dtype=wp.float32),
+    index_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """Keeps and counts in one pass, by one thread."""
+    kept = int(0)
+    non_finite = int(0)
+    out_of_range = int(0)
+    ego = int(0)
+    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
+        p = xyz_in[i]
+        verdict = _verdict(p, limits)
+        if verdict == _KEPT:
+            xyz_out[kept] = p
+            if intensity_in:
+                intensity_out[kept] = intensity_in[i]
+            else:
+                intensity_out[kept] = 0.0
+            index_out[kept] = i
+            kept += 1
+        elif verdict == _NON_FINITE:
+            non_finite += 1
+        elif verdict == _OUT_OF_RANGE:
+            out_of_range += 1
+        else:
+            ego += 1
+    count_out[0] = kept
+    dropped_out[_NON_FINITE] = non_finite
+    dropped_out[_OUT_OF_RANGE] = out_of_range
+    dropped_out[_EGO] = ego
+
+
+@wp.kernel
+def _flag_kept(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    limits: _Limits,
+    # in out: zero
+    dropped: wp.array(dtype=wp.int32),
+    # out
+    kept_out: wp.array(dtype=wp.int32),
+):
+    """1 for each point that stays; dim is the capacity, so that the scan finds no leftovers."""
+    i = wp.tid()
+    kept_out[i] = 0
+    if i >= wp.min(count_in[0], xyz_in.shape[0]):
+        return
+    verdict = _verdict(xyz_in[i], limits)
+    if verdict == _KEPT:
+        kept_out[i] = 1
+    else:
+        wp.atomic_add(dropped, verdict, 1)
+
+
+@wp.kernel
+def _pack_by_rank(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    intensity_in: wp.array(dtype=wp.float32),
+    kept_in: wp.array(dtype=wp.int32),
+    rank_in: wp.array(dtype=wp.int32),
+    # out
+    xyz_out: wp.array(dtype=wp.vec3),
+    intensity_out: wp.array(dtype=wp.float32),
+    index_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """Writes each kept point to its place: the inclusive scan of the flags, less one."""
+    i = wp.tid()
+    if i == rank_in.shape[0] - 1:
+        count_out[0] = rank_in[i]
+    if kept_in[i] == 0:
+        return
+    place = rank_in[i] - 1
+    xyz_out[place] = xyz_in[i]
+    if intensity_in:
+        intensity_out[place] = intensity_in[i]
+    else:
+        intensity_out[place] = 0.0
+    index_out[place] = i
+
+
+@wp.kernel
+def _gather_rows(
+    # in
+    table_in: wp.array2d(dtype=wp.float32),
+    index_in: wp.array(dtype=wp.int32),
+    # out
+    rows_out: wp.array2d(dtype=wp.float32),
+):
+    """One row a thread."""
+    i = wp.tid()
+    for column in range(table_in.shape[1]):
+        rows_out[i, column] = table_in[index_in[i], column]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointFilter:
+    """A plan: workspace for clouds of up to `capacity` points; `launch` allocates nothing and reads nothing back."""
+
+    capacity: int
+    """Points that one launch can take."""
+    point_range: tuple[float, ...] | None = None
+    """xmin ymin zmin xmax ymax zmax [m] of what stays, upper bounds open; None for everywhere."""
+    ego_box: tuple[float, ...] | None = None
+    """xmin ymin zmin xmax ymax zmax [m] of the own vehicle, whose points go, upper bounds open; None for none."""
+    device: str = DEFAULT_DEVICE
+    """A Warp device, such as `cpu` or `cuda:0`."""
+
+    xyz: wp.array = field(init=False, repr=False)
+    """Positions of the points that stay [m], shape (capacity,), vec3."""
+    intensity: wp.array = field(init=False, repr=False)
+    """Their intensities, shape (capacity,), float32."""
+    index: wp.array = field(init=False, repr=False)
+    """Their places in the input, rising, shape (capacity,), int32."""
+    count: wp.array = field(init=False, repr=False)
+    """How many stay, shape (1,), int32."""
+    dropped: wp.array = field(init=False, repr=False)
+    """How many went because not finite, out of range, in the ego box; the first that holds; shape (3,), int32."""
+
+    def __post_init__(self):
+        if self.capacity < 1:
+            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        inside = _EVERYWHERE if self.point_range is None else _checked_box("point_range", self.point_range)
+        ego = _NOWHERE if self.ego_box is None else _checked_box("ego_box", self.ego_box)
+        limits = _Limits()
+        limits.low, limits.high = wp.vec3(*inside[:3]), wp.vec3(*inside[3:])
+        limits.ego_low, limits.ego_high = wp.vec3(*ego[:3]), wp.vec3(*ego[3:])
+        device = resolve_device(self.device)
+
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        def buffer(name: str, length: int, dtype: type) -> None:
+            keep(name, wp.zeros(length, dtype=dtype, device=device))
+
+        keep("_limits", limits)
+        buffer("xyz", self.capacity, wp.vec3)
+        buffer("intensity", self.capacity, wp.float32)
+        buffer("index", self.capacity, wp.int32)
+        buffer("count", 1, wp.int32)
+        buffer("dropped", 3, wp.int32)
+        if device != DEFAULT_DEVICE:
+            buffer("_kept", self.capacity, wp.int32)
+            buffer("_rank", self.capacity, wp.int32)
+
+    def launch(self, xyz: wp.array, intensity: wp.array | None, count: wp.array) -> None:
+        """Fills the outputs from the first `count[0]` points.
+
+        Args:
+            xyz: Positions [m], shape (n,), vec3, n ≤ capacity.
+            intensity: Shape (n,), float32; None where there are none, which gives zeros.
+            count: Shape (1,), int32.
+        """
+        n = xyz.shape[0]
+        if n > self.capacity:
+            raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
+        packed = [self.xyz, self.intensity, self.index, self.count]
+        if self.xyz.device.is_cpu:
+            wp.launch(
+                _pack_in_order,
+                1,
+                inputs=[xyz, intensity, count, self._limits],
+                outputs=[*packed, self.dropped],
+                device=self.device,
+            )
+            return
+        self.dropped.zero_()
+        wp.launch(
+            _flag_kept,
+            self.capacity,
+            inputs=[xyz, count, self._limits, self.dropped],
+            outputs=[self._kept],
+            device=self.device,
+        )
+        wp.utils.array_scan(self._kept, self._rank, inclusive=True)
+        wp.launch(
+            _pack_by_rank,
+            self.capacity,
+            inputs=[xyz, intensity, self._kept, self._rank],
+            outputs=packed,
+            device=self.device,
+        )
+
+
+def _checked_box(name: str, box: Sequence[float]) -> tuple[float, ...]:
+    """The six numbers of a box, low corner first."""
+    numbers = tuple(float(number) for number in box)
+    if len(numbers) != 6 or not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise ValueError(f"{name} must be xmin ymin zmin xmax ymax zmax with min < max, not {box}")
+    return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Filtered:
+    """What `filter_points` left, and how much went why."""
+
+    points: Any
+    """The points that stay, all their columns, in order, shape (m, C), float32."""
+    index: Any
+    """Their places in the input, shape (m,), int32."""
+    non_finite: int
+    """Points that went because a coordinate is not finite."""
+    out_of_range: int
+    """Of the others, those outside `point_range`."""
+    ego: int
+    """Of the others, those inside `ego_box`."""
+
+
+def filter_points(
+    points: Any, *, point_range: Sequence[float] | None = None, ego_box: Sequence[float] | None = None
+) -> Filtered:
+    """Takes out points that are not finite, out of range, or on the own vehicle.
+
+    Args:
+        points: Positions [m] and whatever else in further columns, shape (n, 3 or more), floating.
+        point_range: xmin ymin zmin xmax ymax zmax [m] of what stays, upper bounds open; by default everywhere.
+        ego_box: The same of the own vehicle, whose points go; by default none.
+
+    Returns:
+        The points that stay, as float32, of the family and on the device of `points`, and the counts of the others.
+
+    Raises:
+        TypeError: `points` is not a floating array.
+        ValueError: A shape or a number does not fit; the message says which.
+    """
+    borrowed = borrow_points(points)
+    n, columns = borrowed.table.shape
+    plan = plan_for(
+        PointFilter,
+        capacity=capacity_for(n),
+        point_range=None if point_range is None else _checked_box("point_range", point_range),
+        ego_box=None if ego_box is None else _checked_box("ego_box", ego_box),
+        device=borrowed.device,
+    )
+    plan.launch(borrowed.xyz, borrowed.intensity, count_on(n, borrowed.device))
+    kept = int(plan.count.numpy()[0])
+    on_host = borrowed.device == DEFAULT_DEVICE
+    host = np.empty((kept, columns), np.float32) if on_host else None
+    rows = wp.array(host, copy=False, device="cpu") if on_host else wp.empty((kept, columns), device=borrowed.device)
+    wp.launch(_gather_rows, kept, inputs=[borrowed.table, plan.index], outputs=[rows], device=borrowed.device)
+    non_finite, out_of_range, ego = (int(number) for number in plan.dropped.numpy())
+    return Filtered(
+        adopt(host, borrowed.family) if host is not None else give(rows, borrowed.family),
+        give(plan.index[:kept], borrowed.family),
+        non_finite,
+        out_of_range,
+        ego,
+    )
