@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["SimulatorSource"]
 
-_UNSCORED = ("vegetation",)
-
 
 class SimulatorSource(Source):
     """A simulated drive; the same arguments give the same frames."""
@@ -32,8 +30,9 @@ class SimulatorSource(Source):
         Raises:
             ValueError: There is no such scenario or lidar, or a number makes no sense.
         """
-        from ...models.simulator import Simulator  # its kernels are compiled only when it is used
+        from ...models.simulator import PointClass, Simulator  # its kernels are compiled only when it is used
 
+        self._unscored = PointClass.VEGETATION  # as the ground score of SemanticKITTI leaves it out
         self._simulator = Simulator(scenario=scenario, device=device or "cpu", **options)
         said = "&".join(f"{key}={value}" for key, value in options.items())
         super().__init__(f"sim:{scenario}" + (f"?{said}" if said else ""))
@@ -62,5 +61,6 @@ class SimulatorSource(Source):
                 velocities=np.asarray(frame.velocities, np.float32),
                 points=np.asarray(frame.counts, np.int32),
                 ground=frame.ground,
+                ground_scored=frame.point_class != self._unscored,
             ),
         )

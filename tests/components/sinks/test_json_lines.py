@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.components.messages import Obstacles
 from warploom.components.sinks import JsonLinesSink, read_objects
 from warploom.errors import SinkError, SourceError

@@ -3,6 +3,7 @@ import threading
 
 import numpy as np
 import pytest
+
 from warploom.components.messages import Obstacles
 from warploom.components.sinks import McapSink
 from warploom.components.sinks.mcap import CLOUD_TOPIC, OBSTACLES_TOPIC, TRANSFORM_TOPIC

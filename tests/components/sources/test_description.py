@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.components.messages import Obstacles
 from warploom.components.sinks import JsonLinesSink, McapSink
 from warploom.components.sources import describe, describe_lines

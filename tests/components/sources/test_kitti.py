@@ -3,6 +3,7 @@ import shutil
 
 import numpy as np
 import pytest
+
 from warploom.components.sources import KittiSource, open_source
 from warploom.errors import SourceError
 from warploom.models.classes import CYCLIST, PEDESTRIAN, VEHICLE

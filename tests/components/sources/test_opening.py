@@ -2,6 +2,7 @@ import pathlib
 
 import numpy as np
 import pytest
+
 from warploom.components.sources import KittiSource, ScanFileSource, open_source, read
 from warploom.errors import ConfigError, SourceError
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.components.sources import read, read_scan
 from warploom.components.sources.pcd import decode_pcd, lzf_decompress
 from warploom.errors import SourceError

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.components.sources import read, read_scan
 from warploom.components.sources.ply import decode_ply
 from warploom.errors import SourceError

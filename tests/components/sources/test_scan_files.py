@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.components.sources import read, read_scan
 from warploom.components.sources.scan_files import natural_key, read_times, scan_files, versions_for
 from warploom.errors import SourceError

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from warploom.components.messages import SensorFrame
 from warploom.components.sources import Source
 
