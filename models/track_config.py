@@ -31,6 +31,9 @@ class ClassConfig:
     """It is reported, as coasted, until it was not seen for longer than this [s]."""
     gate: float = 4.0
     """The largest distance of a detection from its track, in standard deviations."""
+    association_std: float = 0.5
+    """Of a detection's centre about its track's along each axis, besides the track's own uncertainty [m]; larger than
+    `position_std`, for detections that are off are off by more than the filter's Gaussian."""
     group: str = ""
     """Classes of the same group can continue each other's tracks; empty: the class by itself."""
     position_std: float = 0.3
@@ -151,6 +154,7 @@ class Parameters:
         self.birth_hits = each("birth_hits").astype(np.int64)
         self.tentative, self.coast, self.report = nanoseconds("tentative"), nanoseconds("coast"), nanoseconds("report")
         self.gate = each("gate")
+        self.association_noise = np.repeat(each("association_std")[:, None] ** 2, 3, axis=1)
         names = [kind.group or f"class {number}" for number, kind in enumerate(kinds)]
         names[-1] = "background"
         self.group = np.array([names.index(name) for name in names])

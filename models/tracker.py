@@ -282,7 +282,7 @@ class Tracker:
         outvoted = f[:, _VOTES] < 0.0
         f[outvoted, _YAW] += np.pi
         f[outvoted, _VOTES] = 1.0
-        measured[opposite, _YAW] += np.pi
+        measured[opposite & ~outvoted, _YAW] += np.pi
 
     def _correct_velocity(self, f: np.ndarray, measured: np.ndarray, kinds: np.ndarray) -> None:
         """Corrects x and y by a measured velocity, where there is one."""
@@ -325,7 +325,7 @@ class Tracker:
         if not n or not m:
             return np.full(n, -1)
         groups, track_kinds = self._parameters.group, self._i[tracks, _KIND]
-        spread = self._f[tracks, 14:17] + self._parameters.noise[track_kinds, :3]
+        spread = self._f[tracks, 14:17] + self._parameters.association_noise[track_kinds]
         scale = 1.0 / np.sqrt(spread[:, :2].max(1))
         if n * m <= _DENSE_PAIRS:
             same = groups[track_kinds][:, None] == groups[z.kinds[detections]]
