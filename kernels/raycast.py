@@ -91,9 +91,11 @@ def _cast(
     best_face = int(_NO_HIT)
     best_label = int(_NO_HIT)
     best_normal = wp.vec3(0.0, 0.0, 0.0)
-    item = int(0)
+    found = int(0)
+    item = int(0)  # the first instance comes first: its hit bounds the search among the others
+    more = bool(True)
     query = wp.bvh_query_ray(scene, origin, direction)
-    while wp.bvh_query_next(query, item, best):
+    while more:
         r0 = rows_in[item, 0]
         r1 = rows_in[item, 1]
         r2 = rows_in[item, 2]
@@ -127,6 +129,8 @@ def _cast(
                     n = hit.normal
                     best_normal = wp.normalize(n[0] * a0 + n[1] * a1 + n[2] * a2)
                 break
+        more = wp.bvh_query_next(query, found, best)
+        item = found + 1
     distance_out[i] = wp.where(best_instance >= 0, best, 0.0)
     instance_out[i] = best_instance
     face_out[i] = best_face
@@ -168,10 +172,11 @@ def _sense(
     k = wp.uint32(i)
     reflectivity = material_in[material, _REFLECTIVITY]
     gloss = material_in[material, _GLOSS]
-    # Lambert's law, and for glossy paint a lobe around the normal; the texture varies by a fifth.
+    # Rough surfaces send back more at a grazing angle than Lambert's law says; glossy paint has a lobe as well.
     texture = 1.0 + 0.2 * _gauss(seed, k, wp.uint32(1))
-    echo = reflectivity * texture * ((1.0 - gloss) * cosine + gloss * wp.pow(cosine, 8.0))
-    # The signal falls with the square of the range; `reach` is where a tenth of full reflectivity is still seen half the time.
+    slant = wp.pow(cosine, 0.7)
+    echo = reflectivity * texture * ((1.0 - gloss) * slant + gloss * wp.pow(cosine, 8.0))
+    # The signal falls with the square of the range: it is 1 at `reach` for a tenth of full reflectivity, face on.
     signal = echo / (d * d) * (reach * reach) * 10.0
     seen = 1.0 / (1.0 + wp.pow(wp.max(signal, 1.0e-6), -3.0))
     chance = _uniform(seed, k, wp.uint32(3))
@@ -179,7 +184,9 @@ def _sense(
         return
     kept_out[i] = 1
     range_out[i] = wp.max(d + range_noise * _gauss(seed, k, wp.uint32(5)), min_range)
-    intensity_out[i] = wp.clamp(echo, 0.0, 1.0)
+    # What is reported is compensated for range and in part for the angle, as sensors do.
+    reported = reflectivity * texture * ((1.0 - gloss) * (0.5 + 0.5 * cosine) + gloss * wp.pow(cosine, 8.0))
+    intensity_out[i] = wp.clamp(reported, 0.0, 1.0)
 
 
 @wp.kernel
@@ -388,6 +395,8 @@ class LidarCast:
     def place(self, mesh: np.ndarray, transforms: np.ndarray) -> None:
         """Sets the instances of the scene.
 
+        Each beam tries the first instance first, so let that be the ground, which most beams hit.
+
         Args:
             mesh: Number of each instance's mesh in `meshes`, shape (k,).
             transforms: World from local, affine, shape (k, 4, 4).
@@ -402,9 +411,12 @@ class LidarCast:
                 f"not {k} and {np.shape(transforms)}"
             )
         device = self.meshes.device
+        if k == 1:  # a tree needs something to hold: the same once more, which changes nothing
+            mesh, transforms, k = np.repeat(mesh, 2), np.repeat(transforms, 2, axis=0), 2
         host = self.meshes.instances(np.asarray(mesh), np.asarray(transforms, np.float64))
-        lower = wp.array(host["lower"], dtype=wp.vec3, device=device)
-        upper = wp.array(host["upper"], dtype=wp.vec3, device=device)
+        # The first instance is tried before the tree is searched, so it is not in the tree.
+        lower = wp.array(host["lower"][1:], dtype=wp.vec3, device=device)
+        upper = wp.array(host["upper"][1:], dtype=wp.vec3, device=device)
         self._scene[:] = [wp.Bvh(lower, upper), lower, upper]
         wp.copy(self._mesh, wp.array(host["mesh"], dtype=wp.uint64, device=device), count=k)
         wp.copy(self._first_face, wp.array(host["first_face"], dtype=wp.int32, device=device), count=k)

@@ -63,7 +63,7 @@ class Lidar:
             turn, shape (n,), float32. The turn begins backwards and runs clockwise seen from above.
         """
         columns, lines = self.columns, self.lines
-        column, line = np.divmod(np.arange(columns * lines), lines)
+        line, column = np.divmod(np.arange(columns * lines), columns)
         shift = self.azimuth_offset * (((np.arange(lines) * 7) % 8) / 3.5 - 1.0)
         azimuth = np.pi - np.deg2rad(column * (360.0 / columns) + shift[line])
         elevation = np.deg2rad(self.elevation)[line]
@@ -87,7 +87,7 @@ LIDARS: dict[str, Lidar] = {
             # Lower block half-degree steps, upper block third-degree steps, as the HDL-64E of KITTI.
             elevation=np.concatenate([np.linspace(-24.8, -8.87, 32), np.linspace(-8.53, 2.0, 32)]),
             azimuth_step=0.173,
-            reach=38.0,
+            reach=60.0,
             range_noise=0.012,
             azimuth_offset=0.08,
         ),

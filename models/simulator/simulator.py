@@ -290,11 +290,12 @@ class Simulator:
     def _street(self, random: np.random.Generator) -> Street:
         ahead = 8.0 * self.duration
         street, plan = random_street(
-            random, style=STYLES[self.seed % 2], extent=(-90.0, ahead + 100.0), duration=self.duration, crossings=2, hilly=0.6
+            random, style=STYLES[self.seed % 2], extent=(-90.0, ahead + 100.0), duration=self.duration, crossings=2,
+            hilly=0.6, parking=(True, True), sidewalk=3.4,
         )  # fmt: skip
         lane = 1.75
         ego = tuple(float(v) for v in self._ego_motion)
-        street.keep_clear(street.path(0.0, -lane, 0.0, ego, 2.6))
+        street.keep_clear(street.track(np.array([4.8, 2.0, 1.7]), 0.0, -lane, 0.0, ego, 0.3))
         self._lane = -lane
         add = street.add
         for kind, s, d, yaw, speed in (
@@ -306,9 +307,9 @@ class Simulator:
         for _ in range(6):
             add("pedestrian", ahead + random.uniform(12, 40), random.choice([-1, 1]) * plan.half_width, np.pi / 2 * random.choice([-1, 1]),
                 motion=(random.uniform(0.9, 1.5), 0.05, 2.0, 0.0))  # fmt: skip
-        populate(street, plan, walkers=0, riders=6, cars=0, works=2)
-        furnish(street, plan, 0.6)
-        populate(street, plan, walkers=40, riders=3, cars=0, works=0)
+        populate(street, plan, walkers=60, riders=10, cars=0, works=2)
+        furnish(street, plan, 0.75)
+        populate(street, plan, walkers=30, riders=0, cars=0, works=0)
         return street
 
     def __len__(self) -> int:

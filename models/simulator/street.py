@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,9 @@ STYLES = ("urban", "residential", "green", "commercial")
 _CARS = {"hatch": 26, "mini": 11, "sedan": 14, "wagon": 14, "suv": 12, "mpv": 9, "coupe": 4, "small_van": 5, "van": 6,
          "minibus": 4, "pickup": 2}  # fmt: skip
 _CAR_NAMES, _CAR_SHARES = tuple(_CARS), np.array(list(_CARS.values())) / sum(_CARS.values())
+
+
+_CELL = 5.0  # [m] edge of a cell of the map of what is taken; no circle in it is wider
 
 
 @dataclass(eq=False)
@@ -49,39 +53,58 @@ class Street:
         self.ground = ground
         self.random = random
         self.things = Things()
-        self.times = np.linspace(0.0, duration, max(1, int(duration / 0.5) + 1))
-        self._circles = np.empty((4096, 3))
-        self._taken = 0
-        self._movers: list[np.ndarray] = []
+        self.times = np.linspace(0.0, duration, max(1, int(duration / 0.25) + 1))
+        self._cells: dict[tuple[int, int], list[tuple[float, float, float]]] = {}
+        self._movers: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def _footprint(self, size: np.ndarray, s: float, d: float, yaw: float, margin: float) -> np.ndarray:
-        """Circles that cover a box in plan, shape (n, 3): s, d, radius."""
-        length, width = max(size[0], size[1]), min(size[0], size[1])
-        if size[1] > size[0]:
-            yaw += np.pi / 2
-        n = max(1, int(np.ceil(length / max(width, 0.5))))
-        along = ((np.arange(n) + 0.5) / n - 0.5) * length
-        radius = 0.5 * np.hypot(length / n, width) * 0.93 + margin
-        return np.stack([s + along * np.cos(yaw), d + along * np.sin(yaw), np.full(n, radius)], 1)
+    @staticmethod
+    def _footprint(size: np.ndarray, s: float, d: float, yaw: float, margin: float) -> list[tuple[float, float, float]]:
+        """Circles that cover a box in plan: s, d, radius."""
+        length, width = float(size[0]), float(size[1])
+        if width > length:
+            length, width, yaw = width, length, yaw + 0.5 * math.pi
+        n = max(1, math.ceil(length / max(width, 0.5)))
+        radius = min(0.465 * math.hypot(length / n, width) + margin, 0.5 * _CELL)
+        c, sn = math.cos(yaw), math.sin(yaw)
+        along = [((k + 0.5) / n - 0.5) * length for k in range(n)]
+        return [(s + a * c, d + a * sn, radius) for a in along]
 
-    def _free(self, circles: np.ndarray) -> bool:
-        taken = self._circles[: self._taken]
-        apart = (taken[:, None, 0] - circles[None, :, 0]) ** 2 + (taken[:, None, 1] - circles[None, :, 1]) ** 2
-        return not (apart < (taken[:, None, 2] + circles[None, :, 2]) ** 2).any()
+    def _free(self, circles: list[tuple[float, float, float]]) -> bool:
+        for s, d, radius in circles:
+            i, j = math.floor(s / _CELL), math.floor(d / _CELL)
+            for cell in ((i + u, j + v) for u in (-1, 0, 1) for v in (-1, 0, 1)):
+                for s1, d1, r1 in self._cells.get(cell, ()):
+                    if (s - s1) ** 2 + (d - d1) ** 2 < (radius + r1) ** 2:
+                        return False
+        return True
 
     def block(self, s: float, d: float, radius: float) -> None:
-        """Keeps a place free [m]."""
-        if self._taken == len(self._circles):
-            self._circles = np.concatenate([self._circles, np.empty_like(self._circles)])
-        self._circles[self._taken] = s, d, radius
-        self._taken += 1
+        """Keeps a place of at most 2.5 m radius free [m]."""
+        cell = (math.floor(s / _CELL), math.floor(d / _CELL))
+        self._cells.setdefault(cell, []).append((s, d, min(radius, 0.5 * _CELL)))
 
-    def path(
-        self, s: float, d: float, yaw: float, motion: tuple[float, float, float, float], radius: float
+    def track(
+        self, size: np.ndarray, s: float, d: float, yaw: float, motion: tuple[float, float, float, float], margin: float
     ) -> np.ndarray:
-        """Where a moving thing is at each of `times`, and its radius, shape (times, 3)."""
-        gone = np.array([float(travelled(np.array(motion), t)) for t in self.times])
-        return np.stack([s + gone * np.cos(yaw), d + gone * np.sin(yaw), np.full(len(gone), radius)], 1)
+        """The circles that a moving box covers at each of `times`, shape (times, n, 3)."""
+        gone = np.array([travelled(np.array(motion), t) for t in self.times])
+        circles = np.tile(np.array(self._footprint(size, s, d, yaw, margin)), (len(gone), 1, 1))
+        circles[:, :, 0] += (gone * np.cos(yaw))[:, None]
+        circles[:, :, 1] += (gone * np.sin(yaw))[:, None]
+        return circles
+
+    def _meets(self, track: np.ndarray) -> bool:
+        """Whether circles, shape (times or 1, n, 3), touch those of something that moves."""
+        low, high = track[..., :2].min((0, 1)) - 6.0, track[..., :2].max((0, 1)) + 6.0
+        for other, other_low, other_high in self._movers:
+            if (other_low > high).any() or (other_high < low).any():
+                continue
+            apart = np.hypot(
+                other[:, :, None, 0] - track[:, None, :, 0], other[:, :, None, 1] - track[:, None, :, 1]
+            )
+            if (apart < other[:, :, None, 2] + track[:, None, :, 2]).any():
+                return True
+        return False
 
     def add(
         self,
@@ -105,25 +128,15 @@ class Street:
             k = random.uniform(0.94, 1.06)
             scale = (k * random.uniform(0.97, 1.03), k * random.uniform(0.97, 1.03), k * random.uniform(0.97, 1.03))
         size = prototype(kind, variant).size * scale
-        if motion[0]:
-            radius = 0.5 * float(np.hypot(size[0], size[1])) + margin
-            track = self.path(s, d, yaw, motion, radius)
-            if not force:
-                if not self._free(track):
-                    return False
-                for other in self._movers:
-                    if (np.hypot(*(other[:, :2] - track[:, :2]).T) < other[:, 2] + track[:, 2]).any():
-                        return False
-            self._movers.append(track)
+        circles = self._footprint(size, s, d, yaw, margin)
+        if motion[0] and len(self.times) > 1:
+            track = self.track(size, s, d, yaw, motion, margin)
+            if self._meets(track) or not all(self._free(row) for row in track.tolist()):
+                return False
+            self.keep_clear(track)
         else:
-            circles = self._footprint(size, s, d, yaw, margin)
-            if not force:
-                if not self._free(circles):
-                    return False
-                for other in self._movers:
-                    apart = np.hypot(other[:, None, 0] - circles[:, 0], other[:, None, 1] - circles[:, 1])
-                    if (apart < other[:, None, 2] + circles[:, 2]).any():
-                        return False
+            if not force and (not self._free(circles) or (self._movers and self._meets(np.array(circles)[None]))):
+                return False
             for circle in circles:
                 self.block(*circle)
         things = self.things
@@ -135,8 +148,8 @@ class Street:
         return True
 
     def keep_clear(self, track: np.ndarray) -> None:
-        """Keeps a moving place free: rows of s, d, radius at each of `times`."""
-        self._movers.append(track)
+        """Keeps the way of something that moves free: circles as `track` makes them."""
+        self._movers.append((track, track[..., :2].min((0, 1)), track[..., :2].max((0, 1))))
 
     def car_kind(self, *, heavy: float = 0.05) -> str:
         """A kind of vehicle as the streets have them, a truck or a bus in a share of `heavy`."""
@@ -393,6 +406,8 @@ def random_street(
     parked: float = 0.6,
     hilly: float = 1.0,
     bend: float = 1.0,
+    parking: tuple[bool, bool] | None = None,
+    sidewalk: float | None = None,
 ) -> tuple[Street, _Plan]:
     """A street with everything that stands still, and its measures; traffic comes afterwards.
 
@@ -405,8 +420,12 @@ def random_street(
         parked: Share of the places along the curb that are taken.
         hilly: Factor on slopes.
         bend: Factor on the curvature.
+        parking: Whether cars park on the left and on the right; None draws it.
+        sidewalk: Width of the sidewalks [m]; None draws it.
     """
-    parking = (bool(random.random() < 0.7), bool(random.random() < 0.7))
+    parking = parking or (bool(random.random() < 0.7), bool(random.random() < 0.7))
+    if sidewalk is None:
+        sidewalk = random.uniform(1.6, 4.0) if style != "green" else random.uniform(1.2, 2.5)
     half_width = random.uniform(3.0, 3.8) + (2.2 if any(parking) else 0.0) + (random.random() < 0.15) * 3.2
     places = []
     for _ in range(crossings):
@@ -416,7 +435,7 @@ def random_street(
     plan = _Plan(
         extent=extent,
         half_width=half_width,
-        sidewalk=random.uniform(1.6, 4.0) if style != "green" else random.uniform(1.2, 2.5),
+        sidewalk=sidewalk,
         parking=parking,
         crossings=places,
         style=style,
@@ -489,7 +508,9 @@ def populate(street: Street, plan: _Plan, *, walkers: int, riders: int, cars: in
         )
     for _ in range(walkers):
         side = random.choice([-1, 1])
-        s, d = random.uniform(low, high), side * (plan.half_width + random.uniform(0.5, max(0.8, plan.sidewalk - 0.3)))
+        # Between lamp posts at the curb and what leans on the houses.
+        strip = (1.0, plan.sidewalk - 0.9) if plan.sidewalk > 2.2 else (0.7, max(0.8, plan.sidewalk - 0.5))
+        s, d = random.uniform(low, high), side * (plan.half_width + random.uniform(*strip))
         draw = random.random()
         if draw < 0.22:
             add("stander", s, d, random.uniform(0, 6.3), margin=0.05)
