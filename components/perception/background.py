@@ -42,7 +42,7 @@ class BackgroundProcessor(Processor):
 
     filtered: In[FilteredCloud]
     clusters: In[Clusters]
-    foreground: In[Detections]
+    foreground: In[Detections] = In(optional=True)
     background: Out[Detections]
 
     def init(self, config: BackgroundConfig) -> None:

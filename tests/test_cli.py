@@ -1,0 +1,143 @@
+"""The command as a user runs it: outputs, messages, exit codes."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+EXAMPLES = pathlib.Path(__file__).resolve().parent.parent / "examples"
+
+
+def warploom(*arguments, cwd, expect=0):
+    """Runs the command and gives its output."""
+    command = [sys.executable, "-c", "from warploom.cli import main; main()", *map(str, arguments)]
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+    assert done.returncode == expect, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory) -> pathlib.Path:
+    """A folder of four scans, the second truncated."""
+    import warploom as wl
+
+    folder = tmp_path_factory.mktemp("scans")
+    for frame in wl.read("sim:street?seed=5&duration=0.4"):
+        frame.points.tofile(folder / f"{frame.index:06d}.bin")
+    whole = (folder / "000001.bin").read_bytes()
+    (folder / "000001.bin").write_bytes(whole[:-7])
+    return folder
+
+
+def test_demo_writes_objects_report_recording_and_picture(tmp_path):
+    output = warploom("demo", "--seconds", "0.5", "--out", "out", cwd=tmp_path)
+    assert "whole frame" in output
+    assert "ground F1" in output
+    lines = (tmp_path / "out" / "objects.jsonl").read_text().splitlines()
+    assert len(lines) == 5
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frames"] == 5
+    assert report["ground_f1"] > 0.9
+    assert report["latency_ms"]["total"]["median"] > 0
+    assert (tmp_path / "out" / "run.mcap").stat().st_size > 1000
+    assert (tmp_path / "out" / "frame.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_keeps_the_frames_around_a_truncated_one_and_reports_it(scans, tmp_path):
+    warploom("run", "--source", f"kitti:{scans}", "--out", "out", cwd=tmp_path)
+    records = [json.loads(line) for line in (tmp_path / "out" / "objects.jsonl").read_text().splitlines()]
+    assert [record["frame"] for record in records] == [0, 2, 3]
+    keys = ["version", "frame", "objects", "missing_inputs", "frame_id", "velocity_reference", "latency_ms"]
+    assert list(records[0]) == keys
+    skipped = json.loads((tmp_path / "out" / "report.json").read_text())["frames_skipped"]
+    assert len(skipped) == 1
+    assert "000001.bin" in skipped[0]["path"]
+
+
+def test_the_same_run_twice_gives_the_same_objects(scans, tmp_path):
+    for out in ("a", "b"):
+        warploom("run", "--source", scans, "--out", out, "--no-mcap", cwd=tmp_path)
+
+    def without_latency(name):
+        records = [json.loads(line) for line in (tmp_path / name / "objects.jsonl").read_text().splitlines()]
+        return [{key: value for key, value in record.items() if key != "latency_ms"} for record in records]
+
+    assert without_latency("a") == without_latency("b")
+
+
+def test_frames_limits_the_run(scans, tmp_path):
+    warploom("run", "--source", scans, "--out", "out", "--frames", 1, "--no-mcap", cwd=tmp_path)
+    assert len((tmp_path / "out" / "objects.jsonl").read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["run"], 2, "Missing option '--source'"),
+        (["run", "--source", "nowhere.bin"], 1, "nowhere.bin"),
+        (["run", "--source", "bogus:thing"], 2, "unknown scheme"),
+        (["run", "--source", "sim:street?seeed=1"], 2, "did you mean 'seed'"),
+        (["run", "--source", "sim:street", "--profile", "nope"], 2, "no profile 'nope'"),
+        (["run", "--source", "sim:street", "--device", "cuda:9"], 2, "no device 'cuda:9'"),
+        (["run", "--source", "sim:street", "--set", "perception.cluster.radius"], 2, "expected key=value"),
+        (["run", "--source", "sim:street", "--set", "perception.cluster.radius=-2"], 2, "greater than 0"),
+        (["check", "missing.yaml"], 2, "there is no such file"),
+        (["graph", "perception", "--format", "jpeg"], 2, "neither text nor mermaid"),
+        (["--log-level", "loud", "info"], 2, "none of debug"),
+    ],
+)
+def test_bad_usage_says_what_and_ends_with_its_code(arguments, code, message, tmp_path):
+    assert message in " ".join(warploom(*arguments, cwd=tmp_path, expect=code).split())
+
+
+def test_a_wrong_key_in_a_module_file_names_file_line_and_the_nearest_key(tmp_path):
+    (tmp_path / "mine.yaml").write_text(
+        "module: mine\ncomponents:\n  - name: a\n    kind: dag\n    trigger: sensor\n"
+        "    inputs: {sensor: lidar/points}\n"
+        "    graph:\n      filter:\n        processor: warploom.components.perception.FilterProcessor\n"
+        "        config:\n          point_rnage: [0, 0, 0, 1, 1, 1]\n"
+    )
+    output = warploom("check", "mine.yaml", cwd=tmp_path, expect=2)
+    assert (
+        "mine.yaml:11: components.0.graph.filter.config.point_rnage: unknown key; did you mean 'point_range'" in output
+    )
+
+
+def test_check_accepts_what_ships(tmp_path):
+    assert "is good" in warploom("check", "cpu", cwd=tmp_path)
+    assert "is good" in warploom("check", "perception", cwd=tmp_path)
+
+
+def test_graph_draws_text_and_mermaid(tmp_path):
+    text = warploom("graph", cwd=tmp_path)
+    assert "filtered -> [ground] -> ground" in text
+    mermaid = warploom("graph", "perception", "--format", "mermaid", cwd=tmp_path)
+    assert mermaid.startswith("flowchart")
+    assert "c_perception_filter -- filtered --> c_perception_ground" in mermaid
+
+
+def test_info_tells_the_machine_or_what_a_file_holds(scans, tmp_path):
+    assert "warp-lang" in warploom("info", cwd=tmp_path)
+    assert "4" in warploom("info", scans, cwd=tmp_path)
+
+
+@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph"])
+def test_every_command_has_help_with_an_example(command, tmp_path):
+    assert "Example:" in warploom(command, "--help", cwd=tmp_path)
+
+
+def test_the_example_of_an_own_processor_runs():
+    command = [sys.executable, str(EXAMPLES / "own_processor" / "run.py")]
+    output = subprocess.run(command, capture_output=True, text=True, check=True, cwd="/").stdout
+    assert len(output.splitlines()) == 10
+    assert "the nearest at" in output
+
+
+def test_the_example_of_your_scans_runs(scans, tmp_path):
+    np.save(tmp_path / "scan.npy", np.fromfile(scans / "000000.bin", np.float32).reshape(-1, 4))
+    command = [sys.executable, str(EXAMPLES / "your_scans.py"), str(tmp_path / "scan.npy")]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "clusters" in output
