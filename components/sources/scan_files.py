@@ -28,6 +28,9 @@ __all__ = [
     "versions_for",
 ]
 
+LATEST = 10**9 << 32
+"""Stamps are before 2106 [ns]: recordings keep the seconds in 32 bits."""
+
 
 def _decode_bin(data: bytes, where: object) -> Scan:
     """KITTI: rows of x y z reflectance."""
@@ -134,15 +137,18 @@ def read_times(path: pathlib.Path) -> list[int]:
         if not text:
             continue
         try:
-            if re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?", text):
-                stamps.append(int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64)))
+            date = re.fullmatch(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?", text)
+            if date:
+                seconds = int(np.datetime64(f"{date[1]}T{date[2]}", "s").astype(np.int64))
+                stamp = seconds * 10**9 + int((date[3] or "").ljust(9, "0"))
             else:
-                stamps.append(round(float(text) * 1e9))
+                stamp = round(float(text) * 1e9)
         except (ValueError, OverflowError):
-            message = (
-                f"{path}, line {number}: {text[:40]!r} is neither seconds nor a date and time (2011-09-26 13:02:25.96)"
-            )
-            raise SourceError(message) from None
+            stamp = -1
+        if not 0 <= stamp < LATEST:
+            what = "is neither seconds nor a date and time (2011-09-26 13:02:25.96) from 1970 to 2106"
+            raise SourceError(f"{path}, line {number}: {text[:40]!r} {what}")
+        stamps.append(stamp)
     return stamps
 
 
@@ -169,7 +175,7 @@ def versions_for(paths: list[pathlib.Path], times: pathlib.Path | None) -> list[
     for digits, scale in ((19, 1), (16, 1000)):
         if all(found and len(found[-1]) == digits for found in numbers):
             stamps = [int(found[-1]) * scale for found in numbers]
-            if all(earlier < later for earlier, later in itertools.pairwise(stamps)):
+            if stamps[-1] < LATEST and all(earlier < later for earlier, later in itertools.pairwise(stamps)):
                 return stamps
     return [index * FRAME_PERIOD for index in range(len(paths))]
 

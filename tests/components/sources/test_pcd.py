@@ -116,6 +116,12 @@ def test_fields_of_any_order_and_type_are_found(kind):
     np.testing.assert_allclose(scan.t, np.arange(9) * 1e-6, rtol=1e-6)  # integers are nanoseconds
 
 
+@pytest.mark.parametrize("body", [("ascii", b""), ("binary", b""), ("binary_compressed", bytes(8))])
+def test_a_file_without_points_is_an_empty_scan(body):
+    scan = decode_pcd(header(body[0], points=0) + body[1], "a.pcd")
+    assert scan.points.shape == (0, 4)
+
+
 def test_stamps_of_a_clock_become_offsets():
     table = np.zeros(3, np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")]))
     table["timestamp"] = 1.6e9 + np.array([0.25, 0.5, 0.0])

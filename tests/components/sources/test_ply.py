@@ -54,6 +54,11 @@ def test_properties_of_any_order_and_type_are_found_after_another_element(format
     np.testing.assert_array_equal(scan.ring, np.arange(5))
 
 
+@pytest.mark.parametrize("format", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_a_file_without_vertices_is_an_empty_scan(format):
+    assert decode_ply(ply(format, 0, b""), "a.ply").points.shape == (0, 4)
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [

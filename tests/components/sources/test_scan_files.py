@@ -182,9 +182,10 @@ def test_times_are_seconds_or_dates(tmp_path):
     path.write_text("0.0\nnever\n")
     with pytest.raises(SourceError, match=r"times.txt, line 2: 'never'"):
         read_times(path)
-    path.write_text("inf\n")
-    with pytest.raises(SourceError, match="line 1"):
-        read_times(path)
+    for bad in ("inf", "nan", "-1.0", "1e300", "2011-99-99 00:00:00", "1800-01-01 00:00:00", "1500-01-01 00:00:00"):
+        path.write_text(f"{bad}\n")
+        with pytest.raises(SourceError, match="line 1"):
+            read_times(path)
 
 
 def test_versions_come_from_the_time_file_else_the_names(tmp_path):
