@@ -105,6 +105,37 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _opset(path: Path) -> int:
+    """The default opset of an ONNX file, read from its outermost fields alone (ModelProto.opset_import is field 8)."""
+
+    def varint(data: bytes, at: int) -> tuple[int, int]:
+        value = shift = 0
+        while True:
+            byte = data[at]
+            value |= (byte & 0x7F) << shift
+            at, shift = at + 1, shift + 7
+            if byte < 0x80:
+                return value, at
+
+    def fields(data: bytes):
+        at = 0
+        while at < len(data):
+            key, at = varint(data, at)
+            kind = key & 7
+            if kind == 0:
+                value, at = varint(data, at)
+            else:
+                size, at = varint(data, at) if kind == 2 else ({1: 8, 5: 4}[kind], at)
+                value, at = data[at : at + size], at + size
+            yield key >> 3, value
+
+    try:
+        imports = [dict(fields(value)) for field, value in fields(path.read_bytes()) if field == 8]
+        return next(int(entry[2]) for entry in imports if not entry.get(1))
+    except (IndexError, KeyError, TypeError, StopIteration) as error:
+        raise ModelError(f"{path}: this is not an ONNX model") from error
+
+
 def load_card(path: str | Path) -> tuple[HeadCard, Path]:
     """Reads a card and checks that its model is there, is the one it means, and that card and model agree in shape.
 
@@ -115,7 +146,7 @@ def load_card(path: str | Path) -> tuple[HeadCard, Path]:
         The card and the path of its ONNX file.
 
     Raises:
-        ModelError: The card is missing or not valid, or the model is missing or has another sha256.
+        ModelError: The card is missing or not valid, or the model is missing or has another sha256 or opset.
     """
     path = Path(path)
     try:
@@ -139,6 +170,9 @@ def load_card(path: str | Path) -> tuple[HeadCard, Path]:
             f"{model}: its sha256 is {found}, but the card {path.name} says {card.sha256}; "
             "the file was changed or is another one: fetch it again, or write a card for it"
         )
+    opset = _opset(model)
+    if opset != card.opset:
+        raise ModelError(f"{model}: its opset is {opset}, but the card {path.name} says {card.opset}")
     return card, model
 
 

@@ -42,7 +42,7 @@ class _Simulated(Protocol):
     ground: np.ndarray
     boxes: np.ndarray
     classes: np.ndarray
-    point_counts: np.ndarray
+    counts: np.ndarray
 
 
 def height_over_ground(points: np.ndarray, ground: np.ndarray, radius: float = 12.0) -> float:
@@ -67,7 +67,7 @@ def _training_frame(frame: _Simulated) -> TrainingFrame:
         ring=frame.ring[inside].astype(np.uint8),
         boxes=np.asarray(frame.boxes, np.float32).reshape(-1, 7),
         classes=np.asarray(frame.classes, np.int32),
-        points_in=np.asarray(frame.point_counts, np.int32),
+        points_in=np.asarray(frame.counts, np.int32),
         sensor_height=height_over_ground(points, np.asarray(frame.ground, bool)[inside]),
     )
 

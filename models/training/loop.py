@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import multiprocessing
 import os
 import time
@@ -136,7 +137,18 @@ def _rate(progress: float, peak: float) -> float:
     """One cycle: a short warm-up, then a cosine down to nearly nothing."""
     if progress < 0.05:
         return peak * (0.1 + 0.9 * progress / 0.05)
-    return peak * (0.002 + 0.998 * 0.5 * (1.0 + np.cos(np.pi * (progress - 0.05) / 0.95)))
+    return peak * (0.002 + 0.998 * 0.5 * (1.0 + math.cos(math.pi * (progress - 0.05) / 0.95)))
+
+
+def _running_average(decay: float) -> Callable[[torch.Tensor, torch.Tensor, int], torch.Tensor]:
+    """An exponential average that forgets the first steps sooner."""
+
+    def average(kept: torch.Tensor, new: torch.Tensor, steps: int | torch.Tensor) -> torch.Tensor:
+        if not kept.is_floating_point():
+            return new
+        return torch.lerp(kept, new, 1.0 - min(decay, (1.0 + int(steps)) / (10.0 + int(steps))))
+
+    return average
 
 
 def _start_workers(config: TrainingConfig) -> list[multiprocessing.Process]:
@@ -178,9 +190,7 @@ def train(config: TrainingConfig) -> TrainingResult:
     torch.manual_seed(config.seed)
     config.out.mkdir(parents=True, exist_ok=True)
     network = PillarCenterNet(config.width, config.depth).to(memory_format=torch.channels_last)
-    averaged = torch.optim.swa_utils.AveragedModel(
-        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(config.average), use_buffers=True
-    )
+    averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_running_average(config.average), use_buffers=True)
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     checkpoint = config.out / "checkpoint.pt"
     iteration, spent = 0, 0.0

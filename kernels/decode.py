@@ -1,0 +1,174 @@
+"""From a centre head's maps to boxes: each peak of a class's heat map is an object, the maps beneath it are its box.
+
+Rows of the maps are counted first and written after, so that the objects come in one order (class, row, column)
+whatever order the threads run in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import warp as wp
+
+from .device import resolve_device
+
+__all__ = ["REGRESSION_MAPS", "CenterDecode"]
+
+REGRESSION_MAPS = 10
+"""After the heat maps (logits): dx dy [cells from the centre], z [m above ground], log l w h, cos and sin of 2 yaw,
+cos and sin of yaw."""
+
+
+@wp.func
+def _is_peak(maps: wp.array3d(dtype=wp.float32), kind: int, row: int, column: int, least: float) -> bool:
+    """Whether a cell is at least as high as its eight neighbours, and higher than those before it."""
+    value = maps[kind, row, column]
+    if not (value >= least):
+        return False
+    peak = bool(True)
+    for dr in range(-1, 2):
+        for dc in range(-1, 2):
+            r = row + dr
+            c = column + dc
+            if r >= 0 and r < maps.shape[1] and c >= 0 and c < maps.shape[2]:
+                other = maps[kind, r, c]
+                before = dr < 0 or (dr == 0 and dc < 0)
+                if other > value or (before and other == value):
+                    peak = False
+    return peak
+
+
+@wp.kernel
+def _count_peaks(
+    # in
+    maps_in: wp.array3d(dtype=wp.float32),
+    least: float,
+    # out
+    peaks_out: wp.array(dtype=wp.int32),
+):
+    """Counts the peaks of each row of each class."""
+    kind, row = wp.tid()
+    found = int(0)
+    for column in range(maps_in.shape[2]):
+        if _is_peak(maps_in, kind, row, column, least):
+            found += 1
+    peaks_out[kind * maps_in.shape[1] + row] = found
+
+
+@wp.kernel
+def _write_boxes(
+    # in
+    maps_in: wp.array3d(dtype=wp.float32),
+    least: float,
+    ends_in: wp.array(dtype=wp.int32),
+    peaks_in: wp.array(dtype=wp.int32),
+    sensor_height_in: wp.array(dtype=wp.float32),
+    low_x: float,
+    low_y: float,
+    cell: float,
+    kinds: int,
+    # out
+    boxes_out: wp.array2d(dtype=wp.float32),
+    scores_out: wp.array(dtype=wp.float32),
+    classes_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """Writes the boxes of each row of each class, from where the rows before it end."""
+    kind, row = wp.tid()
+    line = kind * maps_in.shape[1] + row
+    capacity = scores_out.shape[0]
+    if line == ends_in.shape[0] - 1:
+        count_out[0] = wp.min(ends_in[line], capacity)
+        dropped_out[0] = wp.max(ends_in[line] - capacity, 0)
+    if peaks_in[line] == 0:
+        return
+    slot = ends_in[line] - peaks_in[line]
+    for column in range(maps_in.shape[2]):
+        if _is_peak(maps_in, kind, row, column, least):
+            if slot < capacity:
+                axis = 0.5 * wp.atan2(maps_in[kinds + 7, row, column], maps_in[kinds + 6, row, column])
+                along = wp.cos(axis) * maps_in[kinds + 8, row, column] + wp.sin(axis) * maps_in[kinds + 9, row, column]
+                if along < 0.0:
+                    axis = wp.where(axis > 0.0, axis - wp.PI, axis + wp.PI)
+                boxes_out[slot, 0] = low_x + (float(column) + 0.5 + maps_in[kinds, row, column]) * cell
+                boxes_out[slot, 1] = low_y + (float(row) + 0.5 + maps_in[kinds + 1, row, column]) * cell
+                boxes_out[slot, 2] = maps_in[kinds + 2, row, column] - sensor_height_in[0]
+                for size in range(3):
+                    boxes_out[slot, 3 + size] = wp.exp(wp.clamp(maps_in[kinds + 3 + size, row, column], -4.0, 4.0))
+                boxes_out[slot, 6] = axis
+                scores_out[slot] = 1.0 / (1.0 + wp.exp(-maps_in[kind, row, column]))
+                classes_out[slot] = kind
+            slot += 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CenterDecode:
+    """A plan: the objects in maps of one shape, before suppression.
+
+    Attributes:
+        boxes: Shape (capacity, 7), float32: x y z l w h yaw in the sensor's frame.
+        scores: Shape (capacity,), float32.
+        classes_found: Indices of the heat maps, shape (capacity,), int32.
+        count: How many they are, shape (1,), int32, on the device.
+        dropped: Peaks beyond `capacity`, shape (1,), int32, on the device.
+    """
+
+    shape: tuple[int, int, int]
+    """Maps, rows (along y), columns (along x)."""
+    classes: int
+    """Heat maps, which come first; `REGRESSION_MAPS` follow."""
+    origin: tuple[float, float]
+    """Lowest x and y of the maps [m]."""
+    cell: float
+    """Edge of a cell of the maps [m]."""
+    capacity: int
+    """Most objects."""
+    device: str = "cpu"
+    """A Warp device, such as `cpu` or `cuda:0`."""
+
+    def __post_init__(self):
+        if self.shape[0] != self.classes + REGRESSION_MAPS:
+            raise ValueError(f"shape must begin with {self.classes} + {REGRESSION_MAPS} maps, not {self.shape[0]}")
+        device = resolve_device(self.device)
+
+        def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
+            object.__setattr__(self, name, wp.zeros(shape, dtype=dtype, device=device))
+
+        lines = self.classes * self.shape[1]
+        buffer("_peaks", lines, wp.int32)
+        buffer("_ends", lines, wp.int32)
+        buffer("_height", 1, wp.float32)
+        buffer("boxes", (self.capacity, 7), wp.float32)
+        buffer("scores", self.capacity, wp.float32)
+        buffer("classes_found", self.capacity, wp.int32)
+        buffer("count", 1, wp.int32)
+        buffer("dropped", 1, wp.int32)
+
+    def launch(self, maps: wp.array, score_threshold: float, sensor_height: float | wp.array) -> None:
+        """Fills `boxes`, `scores`, `classes_found`, `count` and `dropped`.
+
+        Args:
+            maps: Shape (1, *shape), float32.
+            score_threshold: Least score of an object, in [0, 1].
+            sensor_height: Height of the sensor above the ground [m]: a number or a device array of one float32.
+        """
+        height = sensor_height
+        if not isinstance(height, wp.array):
+            height = self._height
+            height.fill_(float(sensor_height))
+        p = min(max(score_threshold, 1e-6), 1.0 - 1e-6)
+        least = math.log(p / (1.0 - p))
+        lines = (self.classes, self.shape[1])
+        device = self.scores.device
+        flat = maps[0]
+        wp.launch(_count_peaks, lines, inputs=[flat, least], outputs=[self._peaks], device=device)
+        wp.utils.array_scan(self._peaks, self._ends, inclusive=True)
+        wp.launch(
+            _write_boxes,
+            lines,
+            inputs=[flat, least, self._ends, self._peaks, height, *self.origin, self.cell, self.classes],
+            outputs=[self.boxes, self.scores, self.classes_found, self.count, self.dropped],
+            device=device,
+        )

@@ -1,0 +1,49 @@
+"""`python -m warploom.models.training`: trains a head on the simulator and writes its two files."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+# Threads that wait by spinning slow two that share a core tenfold; OpenMP reads this when torch is loaded.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for the checkpoint, and at the end the head's ONNX and YAML.")],
+    seed: Annotated[int, typer.Option(help="Of weights, draws and variations.")] = 0,
+    minutes: Annotated[float | None, typer.Option(help="Train this long.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Train this far instead: reproducible to the bit.")] = None,
+    frames: Annotated[int, typer.Option(help="Simulated scenes to learn from.")] = 2000,
+    frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
+    threads: Annotated[int, typer.Option(help="CPU threads of the network.")] = 1,
+    workers: Annotated[int, typer.Option(help="Processes that simulate.")] = 1,
+) -> None:
+    """Trains a pillar centre head on simulated scenes; interrupted, the same command goes on."""
+    from .export import export_head
+    from .loop import TrainingConfig, described, train
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if minutes is None and iterations is None:
+        minutes = 40.0
+    config = TrainingConfig(
+        out=out,
+        seed=seed,
+        minutes=minutes,
+        iterations=iterations,
+        frames=frames,
+        frames_folder=frames_folder,
+        threads=threads,
+        workers=workers,
+    )
+    result = train(config)
+    card = export_head(result.network, out, training=described(config, result))
+    logging.getLogger(__name__).info("%d iterations in %.1f minutes: %s", result.iterations, result.minutes, card)
+
+
+if __name__ == "__main__":
+    typer.run(main)
