@@ -1,0 +1,78 @@
+"""What the tests of the runtime share: a package that module files can name, and how a topic is fed and watched."""
+
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "parts"))
+
+
+class Topic:
+    """A topic seen from outside: commits to it, and remembers everything that its subscribers are told."""
+
+    def __init__(self, window):
+        from warploom.datamesh import Output
+
+        self.window = window
+        self.entries, self.settled, self.events = {}, [], []
+        self._changed = threading.Condition()
+        self._output = Output()
+        self._output.bind("test", window)
+        window.subscribe(self._on_commit, self._on_settle)
+
+    def _on_commit(self, entry):
+        with self._changed:
+            self.entries[entry.version] = entry.value
+            self.events.append(entry.version)
+            self._changed.notify_all()
+
+    def _on_settle(self, version):
+        with self._changed:
+            self.settled.append(version)
+            self.events.append(version)
+            self._changed.notify_all()
+
+    def commit(self, version, value=None, policy=None):
+        from warploom.datamesh import CommitPolicy
+
+        with self._output.allocate_change() as change:
+            change.set_version(version)
+            change.value = value
+            return self._output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER if policy is None else policy, change)
+
+    def settle(self, version):
+        self._output.settle(version)
+
+    def wait_for(self, *versions):
+        """Waits until each version was committed or settled."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: set(versions) <= set(self.events), 20), (versions, self.events)
+
+
+@pytest.fixture
+def topic():
+    """Makes a Topic of a window."""
+    return Topic
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a module file and gives its path."""
+
+    def write(text, name="module.yaml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def no_thread_left():
+    """The test ends with the threads it began with."""
+    before = set(threading.enumerate())
+    yield
+    left = set(threading.enumerate()) - before
+    assert not left, f"threads left: {left}"

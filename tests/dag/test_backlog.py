@@ -1,0 +1,125 @@
+"""Backlogs: bounded, with every drop counted. Threads meet by events; nothing is measured."""
+
+import threading
+
+import pytest
+from pydantic import ValidationError
+
+from warploom.dag import BacklogConfig, Trigger
+from warploom.dag.backlog import Backlog
+from warploom.datamesh import LossCounters
+
+
+def make(**config):
+    losses = LossCounters()
+    return Backlog("component", BacklogConfig(**config), losses), losses
+
+
+def fill(backlog, versions):
+    """What each offer dropped."""
+    dropped = [backlog.offer(Trigger(version)) for version in versions]
+    return [trigger and trigger.version for trigger in dropped]
+
+
+def drain(backlog):
+    backlog.close()
+    return [trigger.version for trigger in iter(backlog.take, None)]
+
+
+def test_latest_keeps_the_newest_whatever_depth_is_said():
+    backlog, losses = make(policy="latest", depth=5)
+    assert fill(backlog, [1, 2, 3]) == [None, 1, 2]
+    assert drain(backlog) == [3]
+    assert losses.as_dict() == {"component": {"backlog": 2}}
+
+
+def test_fifo_drops_the_oldest():
+    backlog, losses = make(policy="fifo", depth=2)
+    assert fill(backlog, [1, 2, 3, 4]) == [None, None, 1, 2]
+    assert drain(backlog) == [3, 4]
+    assert losses["component", "backlog"] == 2
+
+
+def test_fifo_drops_the_newest():
+    backlog, losses = make(policy="fifo", depth=2, drop="newest")
+    assert fill(backlog, [1, 2, 3, 4]) == [None, None, 3, 4]
+    assert drain(backlog) == [1, 2]
+    assert losses["component", "backlog"] == 2
+
+
+def test_block_waits_for_room_and_loses_nothing():
+    backlog, losses = make(policy="block", depth=2)
+    producer = threading.Thread(target=fill, args=(backlog, range(50)))
+    producer.start()
+    assert [backlog.take().version for _ in range(50)] == list(range(50))
+    producer.join(10)
+    assert losses.as_dict() == {}
+
+
+def test_block_never_holds_more_than_its_depth():
+    backlog, _ = make(policy="block", depth=3)
+    fill(backlog, [1, 2, 3])
+    producer = threading.Thread(target=fill, args=(backlog, [4]))
+    producer.start()
+    producer.join(0.05)
+    assert producer.is_alive()
+    assert len(backlog._waiting) == 3
+    backlog.take()
+    producer.join(10)
+    assert not producer.is_alive()
+
+
+def test_close_frees_a_producer_that_waits_and_counts_its_frame():
+    backlog, losses = make(policy="block", depth=1)
+    fill(backlog, [1])
+    dropped = []
+    producer = threading.Thread(target=lambda: dropped.extend(fill(backlog, [2])))
+    producer.start()
+    producer.join(0.05)
+    backlog.close()
+    producer.join(10)
+    assert dropped == [2]
+    assert drain(backlog) == [1]
+    assert losses.as_dict() == {"component": {"shutdown": 1}}
+
+
+def test_close_frees_a_consumer_that_waits():
+    backlog, _ = make()
+    taken = []
+    consumer = threading.Thread(target=lambda: taken.append(backlog.take()))
+    consumer.start()
+    backlog.close()
+    consumer.join(10)
+    assert taken == [None]
+
+
+@pytest.mark.parametrize("policy", ["latest", "fifo", "block"])
+def test_a_closed_backlog_takes_nothing_more(policy):
+    backlog, losses = make(policy=policy)
+    backlog.close()
+    assert fill(backlog, [1]) == [1]
+    assert backlog.take() is None
+    assert losses["component", "shutdown"] == 1
+
+
+@pytest.mark.parametrize("config", [{}, {"policy": "fifo", "drop": "newest"}, {"policy": "block"}])
+def test_settled_versions_keep_their_turn_and_take_no_room(config):
+    backlog, losses = make(**config)
+    for version in (1, 3):
+        assert backlog.offer(Trigger(version, settled=True)) is None
+        assert backlog.offer(Trigger(version + 1)) is None if version == 1 else True
+    assert drain(backlog) == [1, 2, 3]
+    assert losses.as_dict() == {}
+
+
+def test_a_settled_version_is_never_the_one_that_is_dropped():
+    backlog, _ = make(policy="latest")
+    backlog.offer(Trigger(1, settled=True))
+    assert fill(backlog, [2, 3]) == [None, 2]
+    assert drain(backlog) == [1, 3]
+
+
+@pytest.mark.parametrize("config", [{"depth": 0}, {"policy": "lifo"}, {"drop": "middle"}, {"size": 3}])
+def test_a_configuration_that_makes_no_sense_is_refused(config):
+    with pytest.raises(ValidationError):
+        BacklogConfig(**config)
