@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ExecutionContext"]
+import warp as wp
+
+__all__ = ["ExecutionContext", "empty_cloud"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,3 +24,12 @@ class ExecutionContext:
     """Threads of a detection head on a CPU."""
     detector: Path | None = None
     """Card of the detection head; None is the shipped one."""
+
+
+def empty_cloud(device: str) -> tuple[wp.array, wp.array]:
+    """No points, and their count: a stage runs on them when it is made, so that its kernels are compiled and loaded.
+
+    Returns:
+        Positions with room for one point, vec3, and the count zero, int32, both on `device`.
+    """
+    return wp.zeros(1, dtype=wp.vec3, device=device), wp.zeros(1, dtype=wp.int32, device=device)

@@ -29,7 +29,8 @@ OBSTACLES_TOPIC = "perception/obstacles"
 POINTS_TOPIC = "perception/points"
 """Where the modules commit what they say of each point."""
 
-_FRAMES_AHEAD = 8
+_REALTIME_FRAMES = 64
+"""Frames that may wait for a caller who is slow to take them, before further ones are dropped at the source."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +258,9 @@ class _Run:
         self._lidar: Output[SensorFrame] = Output()
         self._lidar.bind("lidar", process.mesh.window(LIDAR_TOPIC))
         self._events: queue.Queue[tuple[str, Any]] = queue.Queue()
-        # A caller who is slow to take frames holds up the source, and nothing piles up.
-        self._room = threading.Semaphore(_FRAMES_AHEAD)
+        # As many frames as the modules let into their graphs at once: a frame that is fed does not wait behind others,
+        # so its latency is its own; and a caller who is slow to take frames holds up the source.
+        self._room = threading.Semaphore(_REALTIME_FRAMES if realtime else process.in_flight)
         self._stopping = threading.Event()
         for topic in self._topics:
             process.mesh.window(topic).subscribe(
@@ -311,7 +313,9 @@ class _Run:
                     start_ns = start_ns or (frame.version, time.perf_counter_ns())
                     due = start_ns[1] + frame.version - start_ns[0]
                     self._stopping.wait(max(0.0, (due - time.perf_counter_ns()) / 1e9))
-                self._room.acquire()
+                if not self._room.acquire(blocking=not self._realtime):
+                    self._process.mesh.losses.count("source", "frames_not_taken", frame.version)
+                    continue
                 if self._stopping.is_set():
                     break
                 with self._lidar.allocate_change() as change:

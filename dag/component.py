@@ -170,7 +170,7 @@ class DagComponent(DataProcessComponent):
         self._engine: GraphEngine | None = None
         self._vertices: Sequence[Vertex] = ()
         self._slots = threading.Semaphore(1)
-        self._in_flight = 1
+        self.in_flight = 1
 
     def add_handles(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
         """Adds the inputs and outputs that the configuration names; the class need not declare them."""
@@ -191,7 +191,7 @@ class DagComponent(DataProcessComponent):
         if self.max_in_flight is not None:
             in_flight = min(in_flight, self.max_in_flight)
         self._vertices = vertices
-        self._in_flight = in_flight
+        self.in_flight = in_flight
         self._slots = threading.Semaphore(in_flight)
         self._engine = GraphEngine(self.name, vertices, workers, on_timing)
 
@@ -204,9 +204,9 @@ class DagComponent(DataProcessComponent):
     def stop(self) -> None:
         """Finishes the frames that wait or are in flight, then stops."""
         super().stop()
-        for _ in range(self._in_flight):
+        for _ in range(self.in_flight):
             self._slots.acquire()
-        self._slots.release(self._in_flight)
+        self._slots.release(self.in_flight)
         if self._engine is not None:
             self._engine.stop()
         for vertex in self._vertices:

@@ -272,6 +272,11 @@ class Process:
                 )
             component.set_trigger(spec.trigger, backlog)
 
+    @property
+    def in_flight(self) -> int:
+        """The most frames that one of the graphs lets in at once."""
+        return max((c.in_flight for c in self.components.values() if isinstance(c, DagComponent)), default=1)
+
     def start(self) -> None:
         """Starts the components, those that consume before those that produce; all of them, or none."""
         for component in self._consumers_first():

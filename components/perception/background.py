@@ -12,7 +12,7 @@ from ...kernels.boxes import FitBoxes
 from ...kernels.selection import label_outside_boxes
 from ...models.classes import UNKNOWN
 from ...models.detections import Detections
-from ..execution import ExecutionContext
+from ..execution import ExecutionContext, empty_cloud
 from .clustering import Clusters
 from .filtering import FilteredCloud
 
@@ -51,6 +51,10 @@ class BackgroundProcessor(Processor):
         self._config = config
         self._labels = wp.empty(capacity, dtype=wp.int32, device=device)
         self._fit = FitBoxes(capacity=capacity, max_clusters=config.max_boxes, device=device)
+        xyz, count = empty_cloud(device)
+        labels = wp.full(1, -1, dtype=wp.int32, device=device)
+        label_outside_boxes(xyz, labels, count, np.zeros((1, 7), np.float32), config.margin, self._labels[:1])
+        self._fit.launch(xyz, labels, count)
 
     def process(self, trigger: Trigger) -> Status:
         """Boxes for one frame."""

@@ -12,7 +12,7 @@ from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
 from ...kernels.cluster import EuclideanCluster
 from ...kernels.selection import select_heights
-from ..execution import ExecutionContext
+from ..execution import ExecutionContext, empty_cloud
 from .filtering import FilteredCloud
 from .ground import GroundSurface
 
@@ -56,13 +56,14 @@ class ClusterProcessor(Processor):
         """Makes a plan for each frame in flight."""
         capacity, device = self.context.capacity, self.context.device
         self._config = config
-        self._include = wp.empty(capacity, dtype=wp.bool, device=device)
-        self._plans = cycle(
-            [
-                EuclideanCluster(radius=config.radius, min_size=config.min_size, capacity=capacity, device=device)
-                for _ in range(self.in_flight)
-            ]
-        )
+        self._include = wp.zeros(capacity, dtype=wp.bool, device=device)
+        plans = [
+            EuclideanCluster(radius=config.radius, min_size=config.min_size, capacity=capacity, device=device)
+            for _ in range(self.in_flight)
+        ]
+        xyz, count = empty_cloud(device)
+        plans[0].launch(xyz, count, self._include[:1])
+        self._plans = cycle(plans)
 
     def process(self, trigger: Trigger) -> Status:
         """Clusters one frame."""

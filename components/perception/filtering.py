@@ -13,7 +13,7 @@ from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
 from ...kernels.filters import PointFilter
 from ...kernels.interop import borrow_points
-from ..execution import ExecutionContext
+from ..execution import ExecutionContext, empty_cloud
 from ..messages import SensorFrame
 
 __all__ = ["FilterConfig", "FilterProcessor", "FilteredCloud"]
@@ -66,12 +66,13 @@ class FilterProcessor(Processor):
     def init(self, config: FilterConfig) -> None:
         """Makes a plan for each frame in flight."""
         capacity, device = self.context.capacity, self.context.device
-        self._plans = cycle(
-            [
-                PointFilter(capacity=capacity, point_range=config.point_range, ego_box=config.ego_box, device=device)
-                for _ in range(self.in_flight)
-            ]
-        )
+        plans = [
+            PointFilter(capacity=capacity, point_range=config.point_range, ego_box=config.ego_box, device=device)
+            for _ in range(self.in_flight)
+        ]
+        xyz, count = empty_cloud(device)
+        plans[0].launch(xyz, None, count)
+        self._plans = cycle(plans)
 
     def process(self, trigger: Trigger) -> Status:
         """Uploads and filters one frame."""

@@ -10,7 +10,7 @@ import warp as wp
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
 from ...kernels.ground import GroundSegment
-from ..execution import ExecutionContext
+from ..execution import ExecutionContext, empty_cloud
 from .filtering import FilteredCloud
 
 __all__ = ["GroundProcessor", "GroundSurface"]
@@ -39,12 +39,12 @@ class GroundProcessor(Processor):
     def init(self, config: ProcessorConfig) -> None:
         """Makes a plan for each frame in flight."""
         context = self.context
-        self._plans = cycle(
-            [
-                GroundSegment(capacity=context.capacity, sensor_height=context.mounting_height, device=context.device)
-                for _ in range(self.in_flight)
-            ]
-        )
+        plans = [
+            GroundSegment(capacity=context.capacity, sensor_height=context.mounting_height, device=context.device)
+            for _ in range(self.in_flight)
+        ]
+        plans[0].launch(*empty_cloud(context.device))
+        self._plans = cycle(plans)
 
     def process(self, trigger: Trigger) -> Status:
         """Segments one frame."""
