@@ -28,6 +28,9 @@ class Truth:
     """Over ground, along the cloud's x and y [m/s]; NaN where unknown; shape (k, 2), float32."""
     points: np.ndarray
     """Points of the cloud on the object, shape (k,), int32; −1 where unknown."""
+    complete: bool = True
+    """False where there may be objects without a box, as where labels cover a camera's view only: then an object that
+    was found and fits no box need not be wrong."""
     ground: np.ndarray | None = None
     """True where a point is on the ground, shape (n,), bool; None where no point has a label."""
     ground_scored: np.ndarray | None = None

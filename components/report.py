@@ -39,6 +39,7 @@ class RunReport:
         self._ground_f1: list[float] = []
         self._tracks: list[tuple[np.ndarray, ...]] = []
         self._truth: list[tuple[np.ndarray, ...]] = []
+        self._truth_complete = True
         self._objects: Counter[str] = Counter()
         self._ids: set[int] = set()
 
@@ -65,6 +66,7 @@ class RunReport:
         assert truth is not None
         if truth.ground is not None:
             self._ground_f1.append(ground_scores(frame.ground, truth.ground, truth.ground_scored).f1)
+        self._truth_complete &= truth.complete
         known = ~objects.background
         near = np.hypot(objects.boxes[:, 0], objects.boxes[:, 1]) <= _MAX_DISTANCE
         self._tracks.append(
@@ -104,7 +106,7 @@ class RunReport:
         }
         if self._ground_f1:
             report["ground_f1"] = _mean(self._ground_f1)
-        if self._truth:
+        if any(len(boxes) for _, _, boxes, *_ in self._truth):
             report["objects"] = {"protocol": _PROTOCOL, **self._against_truth()}
         return report
 
@@ -127,7 +129,8 @@ class RunReport:
                 rows[name] = {
                     "objects": summary.objects,
                     "found": _rounded(summary.recall),
-                    "precision": _rounded(summary.precision),
+                    # Without a box for every object, what fits none is not known to be wrong.
+                    "precision": _rounded(summary.precision) if self._truth_complete else None,
                     "id_switches": summary.id_switches,
                     "position_error_m": _rounded(summary.position_error),
                     "velocity_error_mps": _rounded(summary.velocity_error),

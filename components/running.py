@@ -75,7 +75,9 @@ def run_to_folder(
         stack.enter_context(pipeline)
         sinks: list[JsonLinesSink | McapSink] = [stack.enter_context(JsonLinesSink(out / "objects.jsonl"))]
         if mcap:
-            sinks.append(stack.enter_context(McapSink(out / "run.mcap")))
+            # On a vehicle a slow disk must not hold up perception; offline nothing may be lost.
+            when_full = "drop" if realtime else "block"
+            sinks.append(stack.enter_context(McapSink(out / "run.mcap", when_full=when_full)))
         progress = stack.enter_context(_progress(console))
         task = progress.add_task(source.name, total=length)
         first_frame = None
@@ -114,6 +116,10 @@ def run_to_folder(
         },
         frames_skipped=[{"frame": s.index, "path": str(s.path), "reason": s.reason} for s in source.skipped],
         losses=pipeline.losses,
+        sinks={
+            sink.path.name: {"written": sink.written, "dropped": sink.dropped, "objects_refused": sink.refused}
+            for sink in sinks
+        },
         machine=describe_machine(),
     )
     _print(Console(), summary, out, outputs)

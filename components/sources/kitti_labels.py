@@ -57,6 +57,7 @@ class KittiLabels:
             ids=self.ids,
             velocities=np.full((len(boxes), 2), np.nan, np.float32),
             points=points_in_boxes(points, boxes).sum(axis=1).astype(np.int32),
+            complete=False,
         )
 
 
@@ -130,6 +131,7 @@ def read_point_labels(path: pathlib.Path, count: int) -> Truth:
         ids=np.empty(0, np.int64),
         velocities=np.empty((0, 2), np.float32),
         points=np.empty(0, np.int32),
+        complete=False,
         ground=np.isin(kinds, GROUND_LABELS),
         ground_scored=~np.isin(kinds, UNSCORED_LABELS),
     )
