@@ -20,6 +20,7 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "tree": vegetation.tree,
     "bush": vegetation.bush,
     "hedge": vegetation.hedge,
+    "thicket": vegetation.thicket,
     "facade": structures.facade,
     "wall": structures.wall,
     "fence": structures.fence,
@@ -38,7 +39,7 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "barrier": structures.barrier,
 }
 _VARIANTS = {
-    "tree": 16, "bush": 24, "hedge": 10, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8, "sign": 8, "bollard": 4,
+    "tree": 16, "bush": 24, "hedge": 10, "thicket": 14, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8, "sign": 8, "bollard": 4,
     "bin": 6, "cabinet": 8, "hydrant": 2, "bike_rack": 8, "motorbike": 5, "bus_stop": 3, "table": 6, "stairs": 6,
     "cone": 4, "barrier": 8, "pedestrian": 24, "stander": 8, "cyclist": 12,
 }  # fmt: skip

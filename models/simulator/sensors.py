@@ -84,11 +84,12 @@ LIDARS: dict[str, Lidar] = {
         Lidar(name="pandar40", elevation=_dense(40, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=200.0, reach=80.0),
         Lidar(
             name="hdl64",
-            # Lower block half-degree steps, upper block third-degree steps, as the HDL-64E of KITTI.
-            elevation=np.concatenate([np.linspace(-24.8, -8.87, 32), np.linspace(-8.53, 2.0, 32)]),
-            azimuth_step=0.173,
+            # Two blocks of 32: steps of half a degree below −8°, of a third of a degree above.
+            elevation=np.concatenate([np.linspace(-24.2, -8.35, 32), np.linspace(-7.9, 2.6, 32)]),
+            azimuth_step=0.167,
             reach=60.0,
             range_noise=0.012,
+            drop_out=0.03,
             azimuth_offset=0.08,
         ),
         Lidar(name="pandar64", elevation=_dense(64, -25.0, 15.0, -2.0, 3.5), azimuth_step=0.2, max_range=200.0, reach=80.0),

@@ -291,7 +291,7 @@ class Simulator:
         ahead = 8.0 * self.duration
         street, plan = random_street(
             random, style=STYLES[self.seed % 2], extent=(-90.0, ahead + 100.0), duration=self.duration, crossings=2,
-            hilly=0.6, parking=(True, True), sidewalk=3.4,
+            hilly=0.6, parking=(True, True), sidewalk=3.6, half_width=6.2,
         )  # fmt: skip
         lane = 1.75
         ego = tuple(float(v) for v in self._ego_motion)

@@ -21,6 +21,9 @@ _CARS = {"hatch": 26, "mini": 11, "sedan": 14, "wagon": 14, "suv": 12, "mpv": 9,
 _CAR_NAMES, _CAR_SHARES = tuple(_CARS), np.array(list(_CARS.values())) / sum(_CARS.values())
 
 
+# What counts of a thing that others may stand under, or grow into.
+_TRUNKS = {"tree": np.array([0.7, 0.7]), "lamp_post": np.array([0.4, 0.4]), "sign": np.array([0.4, 0.4])}
+_SHARES = {"bush": 0.7, "thicket": 0.75, "hedge": 0.95}
 _CELL = 5.0  # [m] edge of a cell of the map of what is taken; no circle in it is wider
 
 
@@ -128,7 +131,8 @@ class Street:
             k = random.uniform(0.94, 1.06)
             scale = (k * random.uniform(0.97, 1.03), k * random.uniform(0.97, 1.03), k * random.uniform(0.97, 1.03))
         size = prototype(kind, variant).size * scale
-        circles = self._footprint(size, s, d, yaw, margin)
+        footprint = _TRUNKS.get(kind, size * _SHARES.get(kind, 1.0))
+        circles = self._footprint(footprint, s, d, yaw, margin)
         if motion[0] and len(self.times) > 1:
             track = self.track(size, s, d, yaw, motion, margin)
             if self._meets(track) or not all(self._free(row) for row in track.tolist()):
@@ -194,7 +198,7 @@ def _plots(street: Street, plan: _Plan, side: int) -> None:
         if not plan.open_at(s, plan.sidewalk + 0.5):
             s += 1.0
             continue
-        if random.random() < 0.45:
+        if kind == 3 or random.random() < 0.45:
             kind = int(random.choice(6, p=shares))
         if kind == 0:
             variant = int(random.integers(KINDS["facade"]))
@@ -254,7 +258,7 @@ def _plots(street: Street, plan: _Plan, side: int) -> None:
                     add(
                         "tree",
                         s + random.uniform(0, plot),
-                        side * (line + random.uniform(1.2, garden - 1)),
+                        side * (line + random.uniform(1.2, max(1.3, garden - 1))),
                         random.uniform(0, 6.3),
                     )
                 if random.random() < 0.35:
@@ -318,6 +322,38 @@ def _plots(street: Street, plan: _Plan, side: int) -> None:
                 name = ("bush", "tree", "stairs", "cabinet")[random.integers(4)]
                 add(name, s + random.uniform(0, plot), side * (line + random.uniform(1, 25)), random.uniform(0, 6.3))
             s += plot
+
+
+def _backdrop(street: Street, plan: _Plan, side: int) -> None:
+    """Closes the view behind the plots with houses, trees and thickets, and down the side streets."""
+    random, add = street.random, street.add
+    line = plan.half_width + plan.sidewalk
+    s = plan.extent[0]
+    while s < plan.extent[1]:
+        depth = random.uniform(13, 34)
+        draw = random.random()
+        if not plan.open_at(s, plan.sidewalk + 1.0) or draw > 0.85:
+            s += random.uniform(2, 6)
+        elif draw < 0.3:
+            variant = int(random.integers(KINDS["facade"]))
+            width = float(prototype("facade", variant).size[0])
+            if plan.open_at(s + width / 2, plan.sidewalk + width / 2):
+                add("facade", s + width / 2, side * (line + depth + 6), 0.0 if side > 0 else np.pi, variant=variant, margin=-0.5)
+            s += width
+        else:
+            add("thicket" if draw < 0.68 else "tree", s + 3, side * (line + depth), random.normal(0, 0.3))
+            s += random.uniform(3, 7)
+    for at, half in plan.crossings:
+        for k in (-1, 1):
+            yaw = -k * np.pi / 2
+            d = line + random.uniform(1, 8)
+            while d < 60:
+                name = ("facade", "facade", "thicket", "hedge", "wall", "fence", "tree")[random.integers(7)]
+                variant = int(random.integers(KINDS[name]))
+                length = float(prototype(name, variant).size[0])
+                away = half + plan.sidewalk + (random.uniform(0.2, 1.0) if name != "thicket" else 2.0)
+                add(name, at + k * away, side * (d + length / 2), yaw, variant=variant, margin=-0.3)
+                d += length + random.choice([0.0, random.uniform(1, 5)])
 
 
 def _furniture(street: Street, plan: _Plan, side: int) -> None:
@@ -408,6 +444,7 @@ def random_street(
     bend: float = 1.0,
     parking: tuple[bool, bool] | None = None,
     sidewalk: float | None = None,
+    half_width: float | None = None,
 ) -> tuple[Street, _Plan]:
     """A street with everything that stands still, and its measures; traffic comes afterwards.
 
@@ -422,11 +459,12 @@ def random_street(
         bend: Factor on the curvature.
         parking: Whether cars park on the left and on the right; None draws it.
         sidewalk: Width of the sidewalks [m]; None draws it.
+        half_width: Of the carriageway with its parking lanes [m]; None draws it.
     """
     parking = parking or (bool(random.random() < 0.7), bool(random.random() < 0.7))
     if sidewalk is None:
         sidewalk = random.uniform(1.6, 4.0) if style != "green" else random.uniform(1.2, 2.5)
-    half_width = random.uniform(3.0, 3.8) + (2.2 if any(parking) else 0.0) + (random.random() < 0.15) * 3.2
+    half_width = half_width or random.uniform(3.0, 3.9) + (2.2 if any(parking) else 0.0) + (random.random() < 0.15) * 3.2
     places = []
     for _ in range(crossings):
         at = random.uniform(extent[0] + 25, extent[1] - 25)
@@ -459,6 +497,7 @@ def furnish(street: Street, plan: _Plan, parked: float) -> None:
     for side in (1, -1):
         _furniture(street, plan, side)
         _plots(street, plan, side)
+        _backdrop(street, plan, side)
 
 
 def populate(street: Street, plan: _Plan, *, walkers: int, riders: int, cars: int, works: int) -> None:

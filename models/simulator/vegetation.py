@@ -7,7 +7,7 @@ import numpy as np
 from .labels import Material, PointClass, face_label
 from .mesh import Shape, box, join, leaves, tube
 
-__all__ = ["bush", "hedge", "tree"]
+__all__ = ["bush", "hedge", "thicket", "tree"]
 
 _BARK = face_label(Material.BARK, PointClass.VEGETATION)
 _LEAVES = face_label(Material.LEAVES, PointClass.VEGETATION)
@@ -27,7 +27,7 @@ def _cloud(count: int, radii: np.ndarray, random: np.random.Generator, hollow: f
 def tree(random: np.random.Generator) -> Shape:
     """A street tree: bent trunk, some branches, a crown; some are young and thin, some conifers."""
     young = random.random() < 0.35
-    trunk = random.uniform(1.8, 3.2)
+    trunk = random.uniform(1.4, 2.8)
     height = random.uniform(3.5, 6.0) if young else random.uniform(6.0, 12.0)
     radius = random.uniform(0.04, 0.09) if young else random.uniform(0.11, 0.32)
     z = np.array([-0.2, 0.0, 0.35, 0.5 * trunk, trunk, 0.75 * height])
@@ -48,7 +48,7 @@ def tree(random: np.random.Generator) -> Shape:
                 4,
             )
         )
-    count = 220 if young else 520
+    count = 260 if young else 700
     parts.append(leaves(centre + _cloud(count, radii, random, 0.35), 0.22 if young else 0.34, _LEAVES, random))
     return join(*parts)
 
@@ -94,4 +94,19 @@ def hedge(random: np.random.Generator) -> Shape:
     points[:, 1] += wave + random.normal(0, 0.05, count)
     points[:, 2] = np.maximum(points[:, 2] + wave * (points[:, 2] > 0.8 * height) + random.normal(0, 0.04, count), 0.02)
     parts.append(leaves(points, 0.13, _LEAVES, random))
+    return join(*parts)
+
+
+def thicket(random: np.random.Generator) -> Shape:
+    """Bushes and young trees grown together along x: 5 to 9 m long, 2 to 6 m high, ragged in outline."""
+    length, depth, height = random.uniform(5, 9), random.uniform(1.5, 4.0), random.uniform(2.0, 6.0)
+    parts = []
+    for _ in range(random.integers(4, 8)):
+        radii = np.array([random.uniform(0.8, 1.9), random.uniform(0.35, 0.5) * depth, height * random.uniform(0.3, 0.6)])
+        centre = np.array([random.uniform(-0.45, 0.45) * length, random.normal(0, 0.15 * depth), 0.9 * radii[2]])
+        points = centre + _cloud(int(190 * random.uniform(0.7, 1.2)), radii, random, 0.75)
+        points[:, 2] = np.abs(points[:, 2])
+        parts.append(leaves(points, random.uniform(0.22, 0.36), _LEAVES, random))
+        stem = np.array([centre * [1, 1, 0], centre + random.normal(0, 0.3, 3), centre + [0, 0, 0.8 * radii[2]]])
+        parts.append(tube(stem, np.array([0.07, 0.05, 0.02]), _BARK, 5))
     return join(*parts)
