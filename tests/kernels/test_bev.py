@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.kernels.bev import BevMaps, bev
 
 RANGE = (-40.0, -40.0, -2.5, 40.0, 40.0, 1.5)

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.kernels.filters import PointFilter, filter_points
 
 RANGE = (-20.0, -10.0, -2.0, 20.0, 10.0, 1.0)

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.kernels.ground import GroundSegment, elevation_grid, segment_ground
 from warploom.models.evaluation.ground import RANGE_IMAGE_32, SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, ground_scores
 

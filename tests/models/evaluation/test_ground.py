@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from warploom.models.evaluation.ground import RANGE_IMAGE_32, SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, ground_scores
 
 
