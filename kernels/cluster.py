@@ -1,7 +1,7 @@
 """Euclidean clustering, exact: points are of one cluster where a chain of steps no longer than the radius joins them.
 
-Space is cut into cells of side radius / √3, so that a cell is one component by itself and only pairs of cells are left to
-join: those at most two cells apart, by the first pair of points found within the radius. A CPU walks through columns of
+Space is cut into cells of side radius / √3, so that a cell is one component by itself and only pairs of cells are left
+to join: those at most two cells apart, by the first pair of points found within the radius. A CPU walks through columns of
 cells with their neighbours; a GPU tries all pairs of cells at once. The partition is the same, and so are the labels.
 """
 
@@ -67,7 +67,7 @@ def _cell_of(point: wp.vec3, radius: _Radius) -> wp.vec3i:
 
 @wp.func
 def _is_finite(point: wp.vec3) -> bool:
-    return wp.isfinite(point[0]) and wp.isfinite(point[1]) and wp.isfinite(point[2])
+    return (point[0] - point[0]) + (point[1] - point[1]) + (point[2] - point[2]) == 0.0
 
 
 @wp.func
@@ -77,19 +77,21 @@ def _differ(a: wp.vec3i, b: wp.vec3i) -> bool:
 
 @wp.func
 def _hash_cell(cell: wp.vec3i) -> int:
-    mixed = (
-        wp.uint32(cell[0]) * wp.uint32(73856093)
-        ^ wp.uint32(cell[1]) * wp.uint32(19349669)
-        ^ wp.uint32(cell[2]) * wp.uint32(83492791)
+    """Blocks of 4 × 4 × 2 cells are spread over the table; within one, neighbours in space share cache lines."""
+    block = (
+        wp.uint32(cell[0] >> 2) * wp.uint32(73856093)
+        ^ wp.uint32(cell[1] >> 2) * wp.uint32(19349669)
+        ^ wp.uint32(cell[2] >> 1) * wp.uint32(83492791)
     )
-    return int((mixed * _SPREAD) >> wp.uint32(1))
+    within = ((cell[0] & 3) << 3) | ((cell[1] & 3) << 1) | (cell[2] & 1)
+    return int((((block * _SPREAD) >> wp.uint32(7)) << wp.uint32(5)) & wp.uint32(0x3FFFFFE0)) | within
 
 
 @wp.func
 def _hash_column(x: int, y: int) -> int:
-    """Columns that are neighbours in space mostly lie side by side in the table, too: tiles of 512 × 512, spread."""
+    """Tiles of 512 × 512 columns are spread over the table; within one, neighbours in space share cache lines."""
     tile = wp.uint32(x >> 9) * wp.uint32(73856093) ^ wp.uint32(y >> 9) * wp.uint32(19349669)
-    return int(((tile * _SPREAD) ^ wp.uint32((y & 511) * 512 + (x & 511))) & wp.uint32(0x7FFFFFFF))
+    return int(((tile * _SPREAD) ^ wp.uint32((x & 511) * 512 + (y & 511))) & wp.uint32(0x3FFFFFFF))
 
 
 # ---- pairs of cells
@@ -256,10 +258,8 @@ def _gather_cells_in_order(
     cell_begin: wp.array(dtype=wp.int32),
     cell_end: wp.array(dtype=wp.int32),
     cell_column: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.vec2i),
+    columns: wp.array(dtype=wp.vec4i),
     column_slot: wp.array(dtype=wp.int32),
-    column_begin: wp.array(dtype=wp.int32),
-    column_end: wp.array(dtype=wp.int32),
     parent: wp.array(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     stack: wp.array(dtype=wp.vec2i),
@@ -306,10 +306,9 @@ def _gather_cells_in_order(
                         column_count += 1
                         column_table[slot] = k
                         column_slot[k] = slot
-                        columns[k] = wp.vec2i(cell[0], cell[1])
-                        column_end[k] = 0
+                        columns[k] = wp.vec4i(cell[0], cell[1], 0, 0)
                     cell_column[c] = k
-                    column_end[k] = column_end[k] + 1
+                    columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
             cell_of_point[i] = c
             cell_end[c] = cell_end[c] + 1
         else:
@@ -317,18 +316,17 @@ def _gather_cells_in_order(
     # From sizes to where each begins; the end then moves as it is filled.
     begin = int(0)
     for k in range(column_count):
-        column_begin[k] = begin
-        begin += column_end[k]
-        column_end[k] = column_begin[k]
+        column = columns[k]
+        columns[k] = wp.vec4i(column[0], column[1], begin, begin)
+        begin += column[3]
     begin = int(0)
     for v in range(cell_count):
         cell_begin[v] = begin
         begin += cell_end[v]
         cell_end[v] = cell_begin[v]
         k = cell_column[v]
-        end = column_end[k]
-        stack[end] = wp.vec2i(cells[v][2], v)
-        column_end[k] = end + 1
+        stack[columns[k][3]] = wp.vec2i(cells[v][2], v)
+        columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
     for i in range(n):
         v = cell_of_point[i]
         if v >= 0:
@@ -336,63 +334,113 @@ def _gather_cells_in_order(
             points[end] = xyz_in[i]
             cell_end[v] = end + 1
     for k in range(column_count):
-        _sort_by_height(stack, column_begin[k], column_end[k])
+        _sort_by_height(stack, columns[k][2], columns[k][3])
     sizes[0] = cell_count
     sizes[1] = column_count
+
+
+@wp.func
+def _join_stacks(
+    stack: wp.array(dtype=wp.vec2i),
+    begin: int,
+    end: int,
+    other_begin: int,
+    other_end: int,
+    cell_begin: wp.array(dtype=wp.int32),
+    cell_end: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    radius: _Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites the cells of two columns that touch; of a column and itself, where the two begin alike."""
+    low = int(other_begin)
+    for s in range(begin, end):
+        z = stack[s][0]
+        a = stack[s][1]
+        if begin == other_begin:
+            low = s + 1
+        while low < other_end and stack[low][0] < z - 2:
+            low += 1
+        t = int(low)
+        while t < other_end and stack[t][0] <= z + 2:
+            b = stack[t][1]
+            if parent[a] != parent[b]:
+                root_a = _find(parent, a)
+                root_b = _find(parent, b)
+                if root_a != root_b:
+                    if _touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
+                        parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
+            t += 1
 
 
 @wp.kernel
 def _join_in_order(
     # in
     column_table: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.vec2i),
-    column_begin: wp.array(dtype=wp.int32),
-    column_end: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.vec4i),
     stack: wp.array(dtype=wp.vec2i),
     cell_begin: wp.array(dtype=wp.int32),
     cell_end: wp.array(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
     sizes: wp.array(dtype=wp.int32),
     offsets: wp.array(dtype=wp.vec2i),
+    near_offsets: int,
     radius: _Radius,
-    # in out
+    # in out: roots of columns that are of one component, else -1
     parent: wp.array(dtype=wp.int32),
+    column_root: wp.array(dtype=wp.int32),
 ):
-    """Unites cells of neighbouring columns. The nearest columns come first: later most pairs are united already."""
+    """Unites cells of a column and of neighbouring columns, the adjacent first: they leave little to the others."""
     mask = column_table.shape[0] - 1
-    for o in range(offsets.shape[0]):
-        offset = offsets[o]
+    for k in range(sizes[1]):
+        column_root[k] = -1
+        begin = columns[k][2]
+        end = columns[k][3]
+        _join_stacks(stack, begin, end, begin, end, cell_begin, cell_end, points, radius, parent)
+    for ring in range(2):
+        first = int(0)
+        last = int(near_offsets)
+        if ring == 1:
+            first = near_offsets
+            last = offsets.shape[0]
         for k in range(sizes[1]):
-            x = columns[k][0] + offset[0]
-            y = columns[k][1] + offset[1]
-            other = int(k)
-            if o > 0:
+            here = columns[k]
+            root = column_root[k]
+            for o in range(first, last):
+                x = here[0] + offsets[o][0]
+                y = here[1] + offsets[o][1]
                 slot = _hash_column(x, y) & mask
                 other = column_table[slot]
-                while other >= 0 and (columns[other][0] != x or columns[other][1] != y):
-                    slot = (slot + 1) & mask
-                    other = column_table[slot]
-            if other >= 0:
-                low = column_begin[other]
-                end = column_end[other]
-                for s in range(column_begin[k], column_end[k]):
-                    z = stack[s][0]
-                    a = stack[s][1]
-                    if o == 0:
-                        low = s + 1
-                    while low < end and stack[low][0] < z - 2:
-                        low += 1
-                    t = int(low)
-                    root = _find(parent, a)
-                    while t < end and stack[t][0] <= z + 2:
-                        b = stack[t][1]
-                        root_b = _find(parent, b)
-                        if root_b != root:
-                            if _touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
-                                high = wp.max(root, root_b)
-                                root = wp.min(root, root_b)
-                                parent[high] = root
-                        t += 1
+                while other >= 0:
+                    there = columns[other]
+                    if there[0] == x and there[1] == y:
+                        if root < 0 or column_root[other] != root:
+                            _join_stacks(
+                                stack,
+                                here[2],
+                                here[3],
+                                there[2],
+                                there[3],
+                                cell_begin,
+                                cell_end,
+                                points,
+                                radius,
+                                parent,
+                            )
+                        other = -1
+                    else:
+                        slot = (slot + 1) & mask
+                        other = column_table[slot]
+        for c in range(sizes[0]):
+            parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
+        if ring == 0:
+            for k in range(sizes[1]):
+                begin = columns[k][2]
+                root = parent[stack[begin][1]]
+                for s in range(begin + 1, columns[k][3]):
+                    if parent[stack[s][1]] != root:
+                        root = -1
+                column_root[k] = root
 
 
 @wp.kernel
@@ -405,11 +453,11 @@ def _label_in_order(
     cell_end: wp.array(dtype=wp.int32),
     column_slot: wp.array(dtype=wp.int32),
     sizes: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
     min_size: int,
-    # in out: tables left free; parents left as labels
+    # in out: tables left free; members left as labels
     cell_table: wp.array(dtype=wp.int32),
     column_table: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
     members: wp.array(dtype=wp.int32),
     # out
     labels_out: wp.array(dtype=wp.int32),
@@ -418,8 +466,7 @@ def _label_in_order(
     """Counts each component's points, numbers those with enough, and hands the numbers to the points."""
     for c in range(sizes[0]):
         cell_table[cell_slot[c]] = -1
-        root = parent[parent[c]]  # the parent of a lower cell is its root by now
-        parent[c] = root
+        root = parent[c]
         if root == c:
             members[c] = 0
         members[root] = members[root] + cell_end[c] - cell_begin[c]
@@ -716,12 +763,14 @@ class EuclideanCluster:
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         if sequential:
             flat = np.unique(offsets[:, :2], axis=0)
-            flat = flat[np.argsort((flat**2).sum(1), kind="stable")]
+            flat = flat[np.argsort((flat**2).sum(1), kind="stable")][1:]
+            keep("_near_offsets", int((np.abs(flat).max(1) == 1).sum()))
             keep("_offsets", wp.array(flat, dtype=wp.vec2i, device=device))
             keep("_column_table", wp.full(slots, -1, dtype=wp.int32, device=device))
-            buffers(wp.vec2i, "_columns", "_stack")
+            buffers(wp.vec4i, "_columns")
+            buffers(wp.vec2i, "_stack")
             buffers(wp.int32, "_cell_of_point", "_cell_slot", "_cell_column")
-            buffers(wp.int32, "_column_slot", "_column_begin", "_column_end")
+            buffers(wp.int32, "_column_slot", "_column_root")
             keep("_sizes", wp.zeros(2, dtype=wp.int32, device=device))
         else:
             keep("_offsets", wp.array(offsets, dtype=wp.vec3i, device=device))
@@ -758,7 +807,6 @@ class EuclideanCluster:
 
     def _launch_in_order(self, n: int, given: list) -> None:
         tables = [self._table, self._column_table]
-        column_ends = [self._column_begin, self._column_end]
         cell_ends = [self._cell_begin, self._cell_end]
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
@@ -769,24 +817,24 @@ class EuclideanCluster:
             given,
             [
                 *(*tables, self._cell_of_point, self._cells, self._cell_slot, *cell_ends, self._cell_column),
-                *(self._columns, self._column_slot, *column_ends, self._parent, self._points, self._stack, self._sizes),
+                *(self._columns, self._column_slot, self._parent, self._points, self._stack, self._sizes),
             ],
         )
         run(
             _join_in_order,
             [
-                *(self._column_table, self._columns, *column_ends, self._stack, *cell_ends, self._points, self._sizes),
-                *(self._offsets, self._radius),
+                *(self._column_table, self._columns, self._stack, *cell_ends, self._points, self._sizes),
+                *(self._offsets, self._near_offsets, self._radius),
             ],
-            [self._parent],
+            [self._parent, self._column_root],
         )
         run(
             _label_in_order,
             [
                 *(given[1], self._cell_of_point, self._cell_slot, *cell_ends, self._column_slot),
-                *(self._sizes, self.min_size),
+                *(self._sizes, self._parent, self.min_size),
             ],
-            [*tables, self._parent, self._members, self.labels[:n], self.cluster_count],
+            [*tables, self._members, self.labels[:n], self.cluster_count],
         )
 
     def _launch_shared(self, n: int, given: list) -> None:
