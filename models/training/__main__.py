@@ -11,6 +11,7 @@ import typer
 
 # Threads that wait by spinning slow two that share a core tenfold; OpenMP reads this when torch is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def main(
@@ -22,6 +23,7 @@ def main(
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
     threads: Annotated[int, typer.Option(help="CPU threads of the network.")] = 1,
     workers: Annotated[int, typer.Option(help="Processes that simulate.")] = 1,
+    workers_nice: Annotated[int, typer.Option(help="How far those stand back for other processes.")] = 10,
 ) -> None:
     """Trains a pillar centre head on simulated scenes; interrupted, the same command goes on."""
     from .export import export_head
@@ -39,6 +41,7 @@ def main(
         frames_folder=frames_folder,
         threads=threads,
         workers=workers,
+        workers_nice=workers_nice,
     )
     result = train(config)
     card = export_head(result.network, out, training=described(config, result))

@@ -82,7 +82,7 @@ def export_head(
         ),
         classes=HEAD_CLASSES,
         decode=DecodeSpec(
-            stride=STRIDE, score_threshold=score_threshold, nms_iou=0.2, max_candidates=512, max_objects=256
+            stride=STRIDE, score_threshold=score_threshold, nms_iou=0.2, max_candidates=1024, max_objects=256
         ),
         training=training,
         measured=measured or {},

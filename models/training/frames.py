@@ -147,8 +147,8 @@ def augment(frame: TrainingFrame, rng: np.random.Generator, options: Augmentatio
     boxes[:, 3:6] *= scale
     boxes[:, 6] = angle + mirror * boxes[:, 6]
     return TrainingFrame(
-        xyz=frame.xyz[keep] @ matrix.T + offset,
-        ring=frame.ring[keep],
+        xyz=(frame.xyz if share == 1.0 else frame.xyz[keep]) @ matrix.T + offset,
+        ring=frame.ring if share == 1.0 else frame.ring[keep],
         boxes=boxes,
         classes=frame.classes,
         points_in=np.floor(frame.points_in * share).astype(np.int32),

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +56,8 @@ class TrainingConfig:
     threads: int = 1
     workers: int = 1
     """Processes that make frames."""
+    workers_nice: int = 10
+    """How far those stand back for other processes."""
     augmentation: Augmentation = field(default_factory=Augmentation)
 
     def __post_init__(self):
@@ -89,7 +91,10 @@ def make_frames(
     if nice:
         os.nice(nice)
     folder.mkdir(parents=True, exist_ok=True)
+    parent = multiprocessing.parent_process()
     for seed in seeds:
+        if parent is not None and not parent.is_alive():
+            return  # an interrupted training leaves no simulator behind
         path = folder / f"{seed}.npz"
         if not path.exists():
             save_frame(path, simulate(seed))
@@ -157,21 +162,24 @@ def _start_workers(config: TrainingConfig) -> list[multiprocessing.Process]:
     started = []
     for k in range(config.workers):
         process = context.Process(
-            target=make_frames, args=(config.folder, seeds[k :: config.workers]), kwargs={"nice": 10}, daemon=True
+            target=make_frames,
+            args=(config.folder, seeds[k :: config.workers]),
+            kwargs={"nice": config.workers_nice},
+            daemon=True,
         )
         process.start()
         started.append(process)
     return started
 
 
-def _frames_there(config: TrainingConfig) -> Callable[[], list[Path]]:
+def _frames_there(config: TrainingConfig) -> Callable[..., list[Path]]:
     """A function that lists the frames there are, looking again every few seconds until all are."""
     known: list[Path] = []
     looked = -np.inf
 
-    def look() -> list[Path]:
+    def look(now: bool = False) -> list[Path]:
         nonlocal known, looked
-        if len(known) < config.frames and time.monotonic() - looked > 5.0:
+        if len(known) < config.frames and (now or time.monotonic() - looked > 5.0):
             names = (config.folder / f"{_FIRST_TRAINING_SEED + k}.npz" for k in range(config.frames))
             known = [path for path in names if path.exists()]
             looked = time.monotonic()
@@ -206,10 +214,8 @@ def train(config: TrainingConfig) -> TrainingResult:
     there = _frames_there(config)
     wanted = config.frames if config.iterations is not None else min(64, config.frames)
     while len(there()) < wanted:
-        if not any(worker.is_alive() for worker in workers) and len(there()) < wanted:
-            time.sleep(5.1)  # what the last one wrote may not have been looked at
-            if len(there()) < wanted:
-                raise RuntimeError(f"the simulator ended with {len(there())} of {wanted} frames in {config.folder}")
+        if not any(worker.is_alive() for worker in workers) and len(there(now=True)) < wanted:
+            raise RuntimeError(f"the simulator ended with {len(there())} of {wanted} frames in {config.folder}")
         time.sleep(0.5)
 
     began = time.monotonic() - 60.0 * spent
@@ -277,14 +283,13 @@ def train(config: TrainingConfig) -> TrainingResult:
 
 def described(config: TrainingConfig, result: TrainingResult) -> dict[str, object]:
     """What a card says of a training."""
-    recipe = replace(config, out=Path("."), frames_folder=None)
-    kept = {k: v for k, v in asdict(recipe).items() if k not in {"out", "frames_folder", "threads", "workers"}}
-    kept["augmentation"] = asdict(config.augmentation)
+    names = ("batch", "window", "cell", "width", "depth", "learning_rate", "weight_decay", "average")
+    recipe = {name: getattr(config, name) for name in names} | {"augmentation": asdict(config.augmentation)}
     return {
         "data": "scenes of warploom's simulator alone",
         "seed": config.seed,
         "frames": result.frames,
         "iterations": result.iterations,
         "minutes": round(result.minutes, 1),
-        "recipe": {k: v for k, v in kept.items() if k not in {"seed", "frames", "iterations", "minutes"}},
+        "recipe": recipe,
     }

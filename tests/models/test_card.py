@@ -1,0 +1,123 @@
+"""Cards: read back as written, and a model that does not fit is refused by name."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from warploom.errors import ModelError
+from warploom.models.card import DEFAULT_CARD, load_card, save_card
+from warploom.models.head import DetectionHead
+from warploom.models.training.export import export_head
+from warploom.models.training.network import PillarCenterNet
+
+RANGE = (-8.0, -4.0, -2.0, 8.0, 4.0, 6.0)
+
+
+@pytest.fixture
+def card_path(tmp_path):
+    torch.manual_seed(0)
+    return export_head(PillarCenterNet((8, 8, 8)), tmp_path, point_range=RANGE, training={"seed": 0})
+
+
+def edit(path, **changes):
+    """Changes keys, dotted, of a card file."""
+    content = yaml.safe_load(path.read_text())
+    for key, value in changes.items():
+        *parents, last = key.split("__")
+        place = content
+        for parent in parents:
+            place = place[parent]
+        place[last] = value
+    path.write_text(yaml.safe_dump(content))
+
+
+def test_a_card_reads_back_as_written(card_path, tmp_path):
+    card, model = load_card(card_path)
+    assert model.name == "pillar_center.onnx"
+    assert card.input.shape == (1, 20, 32, 64)
+    assert card.output.shape == (1, 15, 16, 32)
+    save_card(tmp_path / "again.yaml", card)
+    assert load_card(tmp_path / "again.yaml")[0] == card
+
+
+def test_a_changed_model_is_refused_by_its_sha256(card_path):
+    model = card_path.with_suffix(".onnx")
+    data = bytearray(model.read_bytes())
+    data[len(data) // 2] ^= 1
+    model.write_bytes(data)
+    with pytest.raises(ModelError, match=r"pillar_center.onnx: its sha256 is [0-9a-f]{64}, but the card"):
+        load_card(card_path)
+
+
+def test_a_missing_model_and_a_missing_card_are_named(card_path):
+    with pytest.raises(ModelError, match="cannot read the head's card"):
+        load_card(card_path.with_name("other.yaml"))
+    card_path.with_suffix(".onnx").unlink()
+    with pytest.raises(ModelError, match=r"pillar_center.onnx is not there"):
+        load_card(card_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"input__shape": [1, 20, 64, 64]}, r"input.shape \(1, 20, 64, 64\) does not follow"),
+        ({"output__shape": [1, 14, 16, 32]}, r"output.shape \(1, 14, 16, 32\) does not follow"),
+        ({"classes": ["vehicle", "unicorn"]}, "no class 'unicorn'"),
+        ({"opset": 16}, "its opset is 17, but the card"),
+        ({"opset": 18}, "opset"),
+        ({"decode__nms_iou": 2.0}, "decode.nms_iou"),
+        ({"surprise": 1}, "surprise"),
+        ({"sha256": "abc"}, "sha256"),
+    ],
+)
+def test_a_card_that_does_not_fit_is_refused(card_path, changes, message):
+    edit(card_path, **changes)
+    with pytest.raises(ModelError, match=message):
+        load_card(card_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"input__name": "points"}, "its input is .*'pillars'.* but the card says .*'points'"),
+        ({"output__name": "boxes"}, "its output is .*'maps'"),
+        (
+            {
+                "input__shape": [1, 20, 32, 32],
+                "input__point_range": [-4, -4, -2, 4, 4, 6],
+                "output__shape": [1, 15, 16, 16],
+            },
+            "its input is",
+        ),
+        ({"input__channels": [f"c{k}" for k in range(20)]}, "channels are not those"),
+    ],
+)
+def test_a_model_that_does_not_fit_its_card_is_refused_before_it_runs(card_path, changes, message):
+    edit(card_path, **changes)
+    with pytest.raises(ModelError, match=message):
+        DetectionHead(card_path, threads=1)
+
+
+def test_what_is_not_a_model_is_refused(card_path):
+    import hashlib
+
+    junk = bytes(np.random.default_rng(0).integers(0, 256, 5000, dtype=np.uint8))
+    card_path.with_suffix(".onnx").write_bytes(junk)
+    edit(card_path, sha256=hashlib.sha256(junk).hexdigest())
+    with pytest.raises(ModelError, match=r"pillar_center.onnx"):
+        DetectionHead(card_path, threads=1)
+
+
+def test_what_is_not_yaml_is_refused(tmp_path):
+    (tmp_path / "card.yaml").write_text("name: [")
+    with pytest.raises(ModelError, match="not YAML"):
+        load_card(tmp_path / "card.yaml")
+
+
+def test_the_shipped_head_fits_its_card_and_is_small():
+    card, model = load_card(DEFAULT_CARD)
+    assert model.stat().st_size <= 8e6
+    assert card.training
+    assert card.measured
+    assert card.licence

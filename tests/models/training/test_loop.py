@@ -1,0 +1,176 @@
+"""The training loop on a handful of tiny scenes: it learns, resumes, repeats, and its export is a head that works."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from warploom.models.card import load_card
+from warploom.models.head import DetectionHead
+from warploom.models.training.export import export_head
+from warploom.models.training.frames import Augmentation, TrainingFrame, augment, load_frame, save_frame
+from warploom.models.training.loop import TrainingConfig, described, make_frames, train
+from warploom.models.training.network import HEAD_CLASSES, REGRESSION, PillarCenterNet
+from warploom.models.training.targets import draw_targets, loss
+
+FIRST = 1_000_000
+
+
+def scene(seed, reach=9.0):
+    """A flat ground with boxes on it whose sides are sprinkled with points."""
+    rng = np.random.default_rng(seed)
+    k = 5
+    boxes = np.c_[
+        rng.uniform(-reach, reach, (k, 2)),
+        np.full(k, 0.75 - 1.7),
+        np.tile([4.2, 1.8, 1.5], (k, 1)),
+        rng.uniform(-np.pi, np.pi, k),
+    ].astype(np.float32)
+    points = [np.c_[rng.uniform(-12, 12, (1500, 2)), rng.normal(-1.7, 0.02, 1500)]]
+    for b in boxes:
+        u = rng.uniform(-0.5, 0.5, (80, 3))
+        u[np.arange(80), rng.integers(0, 2, 80)] = rng.choice([-0.5, 0.5], 80)
+        local = u * b[3:6]
+        c, s = np.cos(b[6]), np.sin(b[6])
+        points.append(b[:3] + np.c_[c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1], local[:, 2]])
+    xyz = np.concatenate(points).astype(np.float32)
+    return TrainingFrame(
+        xyz=xyz,
+        ring=rng.integers(0, 64, len(xyz)).astype(np.uint8),
+        boxes=boxes,
+        classes=np.zeros(k, np.int32),
+        points_in=np.full(k, 80, np.int32),
+        sensor_height=1.7,
+    )
+
+
+@pytest.fixture(scope="module")
+def frames_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    make_frames(folder, range(FIRST, FIRST + 4), scene)
+    return folder
+
+
+def config(out, frames_folder, iterations):
+    return TrainingConfig(
+        out=out,
+        iterations=iterations,
+        frames=4,
+        frames_folder=frames_folder,
+        workers=0,
+        batch=2,
+        window=8.0,
+        width=(8, 8, 8),
+        average=0.5,
+        learning_rate=1e-2,
+        augmentation=Augmentation(shift=1.0),
+    )
+
+
+def test_it_learns_and_its_export_is_a_head(tmp_path, frames_folder):
+    settings = config(tmp_path, frames_folder, 60)
+    result = train(settings)
+    assert result.iterations == 60
+    assert result.losses["heat"] < 8.0  # begins above 20
+    path = export_head(
+        result.network,
+        tmp_path / "head",
+        point_range=(-12.0, -8.0, -2.0, 12.0, 8.0, 6.0),
+        training=described(settings, result),
+    )
+    card, _ = load_card(path)
+    assert card.input.shape == (1, 20, 64, 96)
+    assert card.training["iterations"] == 60
+    head = DetectionHead(path, threads=1, score_threshold=0.05)
+    frame = scene(77, reach=6.0)
+    first = head.detect_points(frame.xyz, frame.sensor_height)
+    assert first.boxes.tobytes() == head.detect_points(frame.xyz, frame.sensor_height).boxes.tobytes()
+
+
+def test_the_export_computes_what_the_network_does(tmp_path):
+    """Within 1e-4: batch norms folded into the convolutions, another order of sums."""
+    import onnxruntime
+
+    torch.manual_seed(3)
+    network = PillarCenterNet((8, 8, 16), (1, 1))
+    network.train()(torch.rand(4, 20, 32, 32))  # batch norms that are not the identity
+    path = export_head(network, tmp_path, point_range=(-4.0, -4.0, -2.0, 4.0, 4.0, 6.0), training={})
+    card, model = load_card(path)
+    pillars = torch.rand(1, 20, 32, 32)
+    session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    got = session.run(None, {card.input.name: pillars.numpy()})[0]
+    with torch.no_grad():
+        np.testing.assert_allclose(got, network.eval()(pillars).numpy(), atol=1e-4)
+
+
+def test_a_seed_repeats_and_a_checkpoint_resumes(tmp_path, frames_folder, caplog):
+    results = [train(config(tmp_path / name, frames_folder, 3)) for name in ("a", "b")]
+    for one, other in zip(*(r.network.state_dict().values() for r in results), strict=True):
+        assert torch.equal(one, other)
+    with caplog.at_level(logging.INFO, logger="warploom.models.training.loop"):
+        resumed = train(config(tmp_path / "a", frames_folder, 5))
+    assert resumed.iterations == 5
+    assert "resuming from iteration 3" in caplog.text
+
+
+def test_no_frames_is_said(tmp_path):
+    with pytest.raises(RuntimeError, match="ended with 0 of 4 frames"):
+        train(config(tmp_path, tmp_path / "nothing", 3))
+
+
+def test_a_frame_file_keeps_millimetres(tmp_path):
+    frame = scene(1)
+    save_frame(tmp_path / "f.npz", frame)
+    back = load_frame(tmp_path / "f.npz")
+    np.testing.assert_allclose(back.xyz, frame.xyz, atol=1.1e-3)
+    np.testing.assert_array_equal(back.boxes, frame.boxes)
+    assert back.sensor_height == pytest.approx(1.7)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_augmentation_keeps_points_in_their_boxes(seed):
+    from warploom.models.geometry import points_in_boxes
+
+    frame = scene(seed)
+    options = Augmentation(thin_rings=0.0, thin_points=0.0, tilt=0.0)
+    varied = augment(frame, np.random.default_rng(seed), options)
+
+    def inside(xyz, boxes):
+        grown = boxes.astype(np.float64).copy()
+        grown[:, 3:6] += 0.02
+        return points_in_boxes(xyz, grown).any(axis=0)
+
+    on_boxes = np.arange(len(frame.xyz)) >= 1500
+    assert inside(frame.xyz, frame.boxes)[on_boxes].all()
+    assert inside(varied.xyz, varied.boxes)[on_boxes].all()
+
+
+def test_targets_say_the_box_at_its_centre():
+    yaw = 2.0
+    boxes = np.array([[1.3, -0.6, -0.9, 4.2, 1.8, 1.5, yaw], [-3.0, 3.0, -0.9, 0.6, 0.6, 1.7, 0.0]], np.float32)
+    targets = draw_targets(boxes, np.array([0, 1]), np.array([50, 2]), (-8.0, -8.0), 0.5, (32, 32), ground=-1.7)
+    row, column = int(7.4 / 0.5), int(9.3 / 0.5)
+    assert targets.heat[0, row, column] == 1.0
+    assert (targets.heat >= 1.0).sum() == 1  # the other has too few points
+    assert targets.mask[1, 22, 10] == 0.0
+    expected = [18.6 - 18.5, 14.8 - 14.5, 0.8, *np.log([4.2, 1.8, 1.5]), np.cos(4), np.sin(4), np.cos(2), np.sin(2)]
+    np.testing.assert_allclose(targets.values[:, row, column], expected, atol=1e-5)
+
+
+def test_saying_the_targets_costs_next_to_nothing():
+    boxes = np.array([[1.3, -0.6, -0.9, 4.2, 1.8, 1.5, 2.0]], np.float32)
+    t = draw_targets(boxes, np.array([0]), np.array([50]), (-8.0, -8.0), 0.5, (32, 32))
+    heat, mask, values, weight = (torch.from_numpy(a)[None] for a in (t.heat, t.mask, t.values, t.weight))
+    right = torch.cat([torch.where(heat >= 1.0, 12.0, -12.0), values], dim=1)
+    wrong = torch.zeros_like(right)
+    assert right.shape[1] == len(HEAD_CLASSES) + len(REGRESSION)
+    assert float(loss(right, heat, mask, values, weight)[0]) < 1e-3
+    assert float(loss(wrong, heat, mask, values, weight)[0]) > 10.0
+
+
+def test_contradicting_lengths_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="either minutes or iterations"):
+        TrainingConfig(out=tmp_path)
+    with pytest.raises(ValueError, match="multiple of 8"):
+        TrainingConfig(out=tmp_path, iterations=1, window=8.1)
