@@ -19,13 +19,13 @@ CLASS_COLOURS = {
     "cyclist": (120, 220, 120),
     "cone": (255, 120, 30),
     "barrier": (220, 200, 90),
-    "unknown": (120, 130, 150),
+    "unknown": (84, 94, 112),
 }
 """Red, green, blue of each class."""
 
 _BACKDROP = np.array([16, 20, 28], np.uint8)
-_GROUND_NEAR, _GROUND_FAR = np.array([92, 104, 122.0]), np.array([38, 46, 60.0])
-_EYE, _TARGET = np.array([-17.0, 0.0, 11.0]), np.array([17.0, 0.0, -2.0])
+_GROUND_NEAR, _GROUND_FAR = np.array([88, 100, 118.0]), np.array([52, 62, 78.0])
+_EYE, _TARGET = np.array([-22.0, 0.0, 14.0]), np.array([14.0, 0.0, -2.0])
 _FOCAL = 0.9  # of the width
 _NEAR = 1.0
 _MAP_RANGE = 50.0
@@ -55,7 +55,7 @@ def draw_frame(frame: PerceptionFrame, width: int = 1600, height: int = 900) -> 
     foreground = int((~frame.objects.background).sum())
     _text(
         canvas,
-        f"{frame.sensor.version / 1e9:.1f} s   {len(frame.points):,} points   {foreground} objects   "
+        f"frame {frame.index}   {len(frame.points):,} points   {foreground} objects   "
         f"{int(frame.objects.background.sum())} background   {frame.latency.total_ms:.0f} ms",
         (margin, height - margin),
         (200, 208, 220),
@@ -88,9 +88,9 @@ def _point_colours(frame: PerceptionFrame) -> np.ndarray:
     distance = np.clip(np.hypot(frame.points[:, 0], frame.points[:, 1]) / 60.0, 0.0, 1.0)[:, None]
     colours = _GROUND_NEAR + (_GROUND_FAR - _GROUND_NEAR) * np.nan_to_num(distance)
     height = np.clip(np.nan_to_num(frame.height) / 5.0, 0.0, 1.0)
-    ramp = cv2.applyColorMap((40 + 160 * height).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    ramp = cv2.applyColorMap((90 + 150 * height).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     standing = ~frame.ground
-    colours[standing] = 0.75 * ramp[standing]
+    colours[standing] = ramp[standing]
     objects = frame.objects
     for box, class_index in zip(objects.boxes[~objects.background], objects.classes[~objects.background], strict=True):
         x, y = frame.points[:, 0] - box[0], frame.points[:, 1] - box[1]
@@ -124,7 +124,7 @@ def _draw_scene(canvas: np.ndarray, frame: PerceptionFrame, xyz: np.ndarray, col
     order = order[depth[order] > _NEAR]
     u, v = np.floor(pixels[order]).astype(np.int64).T
     for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        near = (depth[order] < 45.0) | (dx + dy == 0)
+        near = (depth[order] < 70.0) | (dx + dy == 0)
         kept = near & (u + dx >= 0) & (u + dx < width) & (v + dy >= 0) & (v + dy < height)
         canvas[v[kept] + dy, u[kept] + dx] = colours[order][kept]
     objects = frame.objects
@@ -178,5 +178,4 @@ def _draw_map(frame: PerceptionFrame, xyz: np.ndarray, colours: np.ndarray, side
 def _text(canvas: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:
     import cv2
 
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
     cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
