@@ -1,8 +1,8 @@
 """Euclidean clustering, exact: points are of one cluster where a chain of steps no longer than the radius joins them.
 
-Space is cut into cells of side radius / √3, so that a cell is one component by itself and only pairs of cells are left
-to join: those at most two cells apart, by the first pair of points found within the radius. A CPU walks through columns of
-cells with their neighbours; a GPU tries all pairs of cells at once. The partition is the same, and so are the labels.
+Space is cut into cells of side radius / √3, so that a cell is one component by itself and only pairs of cells are
+left to join: those at most two cells apart, by the first pair of points found within the radius. A CPU walks through
+columns of cells with their neighbours; a GPU tries all pairs of cells at once. The labels are the same.
 """
 
 from __future__ import annotations
@@ -367,9 +367,8 @@ def _join_stacks(
             if parent[a] != parent[b]:
                 root_a = _find(parent, a)
                 root_b = _find(parent, b)
-                if root_a != root_b:
-                    if _touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
-                        parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
+                if root_a != root_b and _touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
+                    parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
             t += 1
 
 

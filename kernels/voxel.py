@@ -552,7 +552,10 @@ def voxelize(
         ValueError: A shape or a number does not fit; the message says which.
     """
     borrowed = borrow_points(points)
-    size = tuple(float(edge) for edge in np.broadcast_to(np.asarray(voxel_size, np.float64), (3,)))
+    edges = np.asarray(voxel_size, np.float64).ravel()
+    if edges.size not in (1, 3):
+        raise ValueError(f"voxel_size must be one number or three, not {edges.size}")
+    size = tuple(float(edge) for edge in np.broadcast_to(edges, 3))
     limits = tuple(float(limit) for limit in point_range)
     if len(limits) != 6:
         raise ValueError(f"point_range must have six numbers, xmin ymin zmin xmax ymax zmax, not {len(limits)}")
