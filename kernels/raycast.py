@@ -63,7 +63,7 @@ def _cast(
     max_range: float,
     seed_in: wp.array(dtype=wp.uint32),
     # in: scene
-    scene: wp.uint64,
+    scene_in: wp.array(dtype=wp.uint64),
     mesh_in: wp.array(dtype=wp.uint64),
     first_face_in: wp.array(dtype=wp.int32),
     rows_in: wp.array2d(dtype=wp.vec4),
@@ -94,7 +94,7 @@ def _cast(
     found = int(0)
     item = int(0)  # the first instance comes first: its hit bounds the search among the others
     more = bool(True)
-    query = wp.bvh_query_ray(scene, origin, direction)
+    query = wp.bvh_query_ray(scene_in[0], origin, direction)
     while more:
         r0 = rows_in[item, 0]
         r1 = rows_in[item, 1]
@@ -374,6 +374,7 @@ class LidarCast:
         hold("_seed", wp.zeros(1, dtype=wp.uint32, device=device))
         hold("_material", wp.zeros((MATERIALS, 4), dtype=wp.float32, device=device))
         hold("_scene", [])
+        hold("_scene_id", wp.zeros(1, dtype=wp.uint64, device=device))
         hold("_mesh", wp.zeros(self.max_instances, dtype=wp.uint64, device=device))
         hold("_first_face", wp.zeros(self.max_instances, dtype=wp.int32, device=device))
         hold("_rows", wp.zeros((self.max_instances, 3), dtype=wp.vec4, device=device))
@@ -418,6 +419,7 @@ class LidarCast:
         lower = wp.array(host["lower"][1:], dtype=wp.vec3, device=device)
         upper = wp.array(host["upper"][1:], dtype=wp.vec3, device=device)
         self._scene[:] = [wp.Bvh(lower, upper), lower, upper]
+        self._scene_id.assign(np.array([self._scene[0].id], np.uint64))
         wp.copy(self._mesh, wp.array(host["mesh"], dtype=wp.uint64, device=device), count=k)
         wp.copy(self._first_face, wp.array(host["first_face"], dtype=wp.int32, device=device), count=k)
         wp.copy(self._rows, wp.array(host["rows"].reshape(k, 3, 4), dtype=wp.vec4, device=device), count=3 * k)
@@ -440,12 +442,11 @@ class LidarCast:
     def launch(self) -> None:
         """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`."""
         device, n = self.meshes.device, self._beams.shape[0]
-        scene = self._scene[0].id
         wp.launch(
             _cast,
             dim=n,
             inputs=[
-                self._beams, self._fraction, self._pose, self.max_range, self._seed, scene, self._mesh,
+                self._beams, self._fraction, self._pose, self.max_range, self._seed, self._scene_id, self._mesh,
                 self._first_face, self._rows, self.meshes.labels, self._material,
             ],
             outputs=[self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],

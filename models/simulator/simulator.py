@@ -14,6 +14,7 @@ from .labels import GROUND_CLASSES, material_table
 from .library import Library, object_class, prototype
 from .sensors import LIDARS, Lidar, lidar_model
 from .street import STYLES, Street, furnish, phase_of, populate, random_street, travelled
+from .terrain import Ground
 
 __all__ = ["SCENARIOS", "SimulatedFrame", "Simulator", "sample_scene"]
 
@@ -126,7 +127,7 @@ class _World:
 
 
 def place(
-    ground, s: np.ndarray, d: np.ndarray, yaw: np.ndarray, lift: np.ndarray, scale: np.ndarray, upright: np.ndarray
+    ground: Ground, s: np.ndarray, d: np.ndarray, yaw: np.ndarray, lift: np.ndarray, scale: np.ndarray, upright: np.ndarray
 ) -> np.ndarray:
     """World from local of things on the ground, shape (k, 4, 4); those not upright follow its slope."""
     x, y, bend = ground.to_world(s, d)
@@ -317,6 +318,11 @@ class Simulator:
 
     def __iter__(self) -> Iterator[SimulatedFrame]:
         return (self.frame(index) for index in range(len(self)))
+
+    @property
+    def ground(self) -> Ground:
+        """The height field under the street."""
+        return self._world.ground
 
     def pose(self, t: float) -> np.ndarray:
         """World from sensor at time t [s], shape (4, 4)."""

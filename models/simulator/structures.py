@@ -88,6 +88,9 @@ def facade(random: np.random.Generator) -> Shape:
     )
     if random.random() < 0.6:
         ridge = height + random.uniform(1.5, 3.5)
+        for x in (-half, half):
+            gable = np.array([[x, 0, height], [x, back, height], [x, back / 2, ridge], [x, back / 2, ridge]])
+            parts.append(quad(gable, masonry))
         for y in (-0.3, back + 0.3):
             parts.append(
                 quad(
