@@ -21,38 +21,41 @@ class ClassConfig:
     """Detections from here on choose their tracks first; the others take what is left."""
     birth_score: float = 0.3
     """Detections from here on begin a track, if none takes them up."""
-    birth_hits: int = 3
+    birth_hits: int = 2
     """Detections until a track is confirmed and reported; in the first frame one is enough."""
     tentative: float = 0.15
     """A track not yet confirmed ends when it is not seen for longer than this [s]."""
-    coast: float = 1.5
+    coast: float = 1.2
     """A confirmed one ends when it is not seen for longer than this [s]."""
-    report: float = 0.35
+    report: float = 0.15
     """It is reported, as coasted, until it was not seen for longer than this [s]."""
-    gate: float = 4.0
+    gate: float = 3.0
     """The largest distance of a detection from its track, in standard deviations."""
-    association_std: float = 0.5
+    association_std: float = 0.45
     """Of a detection's centre about its track's along each axis, besides the track's own uncertainty [m]; larger than
     `position_std`, for detections that are off are off by more than the filter's Gaussian."""
+    association_limit: float = 1.0
+    """The most that the track's own uncertainty counts for in association [m], so that one that has long coasted does
+    not reach out for the detections of others; in proportion more where frames are further apart than 0.1 s."""
     group: str = ""
     """Classes of the same group can continue each other's tracks; empty: the class by itself."""
-    position_std: float = 0.3
+    position_std: float = 0.1
     """Of a measured centre, along each axis [m]."""
     size_std: float = 0.3
     """Of a measured length, width, height [m]."""
-    yaw_std: float = 0.3
+    yaw_std: float = 0.2
     """Of a measured heading [rad]."""
     velocity_std: float = 1.0
     """Of a measured velocity, where detections bring one [m/s]."""
     speed_std: float = 10.0
     """Of the velocity of an object seen for the first time, along each axis of the ground [m/s]; 0: it never moves."""
-    acceleration_std: float = 3.0
+    acceleration_std: float = 5.0
     """By how much a velocity changes within a second, along each axis of the ground [m/s]."""
     vertical_std: float = 0.3
     """By how much a height changes within a second [m]."""
-    size_drift: float = 0.05
+    size_drift: float = 0.2
     """By how much a size changes within a second [m]."""
-    yaw_drift: float = 0.5
+    yaw_drift: float = 0.8
     """By how much a heading changes within a second [rad]."""
 
 
@@ -107,7 +110,7 @@ class TrackerConfig:
     """How much a difference in size counts beside distance: for a factor e, this many squared standard deviations."""
     longest_gap: float = 2.0
     """No track outlives a longer gap between frames [s]."""
-    score_weight: float = 0.1
+    score_weight: float = 0.5
     """Least weight of the newest score in a track's mean."""
     coasted_score: float = 0.9
     """Factor on the score of a track that is coasting."""
@@ -154,6 +157,7 @@ class Parameters:
         self.birth_hits = each("birth_hits").astype(np.int64)
         self.tentative, self.coast, self.report = nanoseconds("tentative"), nanoseconds("coast"), nanoseconds("report")
         self.gate = each("gate")
+        self.association_limit = np.repeat(each("association_limit")[:, None] ** 2, 3, axis=1)
         self.association_noise = np.repeat(each("association_std")[:, None] ** 2, 3, axis=1)
         names = [kind.group or f"class {number}" for number, kind in enumerate(kinds)]
         names[-1] = "background"

@@ -31,6 +31,7 @@ _YAW = 6
 _ID, _KIND, _BORN, _SEEN, _HITS, _AGE, _CONFIRMED, _MATCHED = range(8)
 
 _MOST_VOTES = 5.0  # for a heading: so many detections the other way turn it round
+_USUAL_PERIOD = 0.1  # [s]
 _DENSE_PAIRS = 40_000  # up to here every pair is looked at; beyond, neighbours only
 _NEIGHBOURS = 12
 
@@ -93,6 +94,7 @@ class Tracker:
         self._pose: np.ndarray | None = None
         self._motion = (np.zeros(6), 1.0)  # the ego's last motion and the seconds it took
         self._frames = 0
+        self._seconds = 0.0  # between this frame and the last
 
     def __len__(self) -> int:
         """Tracks alive, reported or not."""
@@ -140,6 +142,7 @@ class Tracker:
         self._version = version
         self._frames += 1
 
+        self._seconds = seconds
         self._predict(seconds)
         if pose is not None:
             z.boxes = transform_boxes(z.boxes, pose)
@@ -325,7 +328,9 @@ class Tracker:
         if not n or not m:
             return np.full(n, -1)
         groups, track_kinds = self._parameters.group, self._i[tracks, _KIND]
-        spread = self._f[tracks, 14:17] + self._parameters.association_noise[track_kinds]
+        limit = self._parameters.association_limit[track_kinds] * max(self._seconds / _USUAL_PERIOD, 1.0) ** 2
+        spread = np.minimum(self._f[tracks, _PXX][:, :3], limit)
+        spread += self._parameters.association_noise[track_kinds]
         scale = 1.0 / np.sqrt(spread[:, :2].max(1))
         if n * m <= _DENSE_PAIRS:
             same = groups[track_kinds][:, None] == groups[z.kinds[detections]]

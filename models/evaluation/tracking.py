@@ -277,7 +277,8 @@ def _score(recordings: list[_Recording], least_confidence: float | None) -> Clea
         false_positives += int((present & ~taken & ~r.tracks_ignored).sum())
         objects += int((~r.truth_ignored).sum())
         likeness += float((r.cost if r.measure == "distance" else 1.0 - r.cost)[found].sum())
-        ids = np.where(found, r.tracks.ids[match], -1)
+        ids = np.full(len(match), -1)
+        ids[found] = r.tracks.ids[match[found]]
         changes = _changes(r.truth.ids, ids, r.truth_ignored)
         switches += changes[0]
         fragments += changes[1]
