@@ -55,19 +55,21 @@ class Backlog:
         """
         dropped: Trigger | None = None
         with self._changed:
-            if not trigger.settled:
-                while self._policy == "block" and self._full() and not self._closed:
-                    self._changed.wait()
-                if self._closed or (self._drop_newest and self._full()):
+            while self._policy == "block" and self._full() and not (self._closed or trigger.settled):
+                self._changed.wait()
+            if self._closed:
+                dropped = trigger
+            elif not trigger.settled and self._full():
+                if self._drop_newest:
                     dropped = trigger
-                elif self._full():
+                else:
                     dropped = next(waiting for waiting in self._waiting if not waiting.settled)
                     self._waiting.remove(dropped)
             if dropped is not trigger:
                 self._waiting.append(trigger)
                 self._changed.notify_all()
             reason = "shutdown" if self._closed else "backlog"
-        if dropped is not None:
+        if dropped is not None and not dropped.settled:
             self._losses.count(self._place, reason, dropped.version)
         return dropped
 

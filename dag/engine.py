@@ -151,14 +151,15 @@ class GraphEngine:
             for vertex in self._vertices:
                 if vertex.predecessors == 0:
                     run.ready_ns[vertex] = now
-                    self._offer(vertex)
+                    self._changed.notify(self._offer(vertex))
 
-    def _offer(self, vertex: Vertex) -> None:
-        """Hands the vertex's next frame to the workers if both are ready. Called with the lock held."""
-        if not vertex.busy and vertex.queue and vertex.queue[0].waiting[vertex] == 0:
-            vertex.busy = True
-            self._ready.append((vertex, vertex.queue.popleft()))
-            self._changed.notify()
+    def _offer(self, vertex: Vertex) -> int:
+        """Makes the vertex's next frame ready to run if both are; gives how many it made. Called with the lock held."""
+        if vertex.busy or not vertex.queue or vertex.queue[0].waiting[vertex] > 0:
+            return 0
+        vertex.busy = True
+        self._ready.append((vertex, vertex.queue.popleft()))
+        return 1
 
     def _work(self) -> None:
         while True:
@@ -174,12 +175,15 @@ class GraphEngine:
                 vertex.busy = False
                 run.remaining -= 1
                 done = run.remaining == 0
+                ready = 0
                 for successor in vertex.successors:
                     run.waiting[successor] -= 1
                     if run.waiting[successor] == 0:
                         run.ready_ns[successor] = now
-                        self._offer(successor)
-                self._offer(vertex)
+                        ready += self._offer(successor)
+                ready += self._offer(vertex)
+                # One is for this worker, without a change of threads, unless it has a frame to hand over first.
+                self._changed.notify(ready if done else max(0, ready - 1))
             if done:
                 self._tell(run.on_done, run)
             del vertex, run  # a worker that waits must not keep a frame alive

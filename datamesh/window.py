@@ -21,7 +21,7 @@ __all__ = ["CommitPolicy", "Entry", "Miss", "Snapshot", "Window"]
 
 T = TypeVar("T")
 
-_REMEMBERED = 1024
+_REMEMBERED = 256
 """How many settled and how many evicted versions a window knows one by one."""
 
 

@@ -123,3 +123,11 @@ def test_a_settled_version_is_never_the_one_that_is_dropped():
 def test_a_configuration_that_makes_no_sense_is_refused(config):
     with pytest.raises(ValidationError):
         BacklogConfig(**config)
+
+
+def test_a_closed_backlog_gives_back_what_is_settled_and_counts_no_loss():
+    backlog, losses = make()
+    backlog.close()
+    trigger = Trigger(1, settled=True)
+    assert backlog.offer(trigger) is trigger
+    assert losses.as_dict() == {}

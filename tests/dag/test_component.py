@@ -346,6 +346,19 @@ def test_commits_after_the_stop_are_counted_and_settled(topic):
     assert mesh.losses.as_dict() == {"doubler": {"shutdown": 1}}
 
 
+def test_a_chain_that_was_stopped_still_settles_to_its_end(topic):
+    mesh = DataMesh()
+    chain = [doubler(mesh, name=f"c{i}", topics=(f"t{i}", f"t{i + 1}")) for i in range(3)]
+    given, result = topic(mesh.window("t0")), topic(mesh.window("t3"))
+    for component in reversed(chain):
+        component.start()
+    for component in chain:
+        component.stop()
+    given.commit(1, 1)
+    assert result.settled == [1]
+    assert mesh.losses.as_dict() == {"c0": {"shutdown": 1}}
+
+
 def test_stop_closes_all_processors_even_when_one_fails(caplog):
     closed = []
 

@@ -196,7 +196,7 @@ def test_the_memory_of_settled_and_evicted_versions_is_bounded():
     for version in range(0, 6000, 2):
         window.commit(DISCARD, entry(version))
         window.settle(version + 1)
-    assert len(window._state.settled) == len(window._evicted) == 1024
+    assert len(window._state.settled) == len(window._evicted) == 256
     assert window.snapshot().miss(5999) is Miss.SETTLED_EMPTY
 
 
