@@ -57,6 +57,23 @@ def declare_vertices(
                 first = f"vertex {other!r}" if other else "the component's input of that name"
                 raise file.error([*keys, "graph", name], f"datum {datum!r} has two producers: this and {first}")
             producers[datum] = name
+    _check_inputs(file, keys, component, vertices, producers)
+    _check_commits(file, keys, declared)
+    order = vertex_order(vertices.values(), component.inputs)
+    if len(order) < len(vertices):
+        stuck = _cycle([vertex for name, vertex in vertices.items() if name not in order])
+        raise file.error([*keys, "graph", stuck[0]], f"these vertices wait for each other in a cycle: {stuck}")
+    return [declared[name] for name in order]
+
+
+def _check_inputs(
+    file: ConfigFile[ModuleSpec],
+    keys: Sequence[str | int],
+    component: ComponentSpec,
+    vertices: Mapping[str, Vertex],
+    producers: Mapping[str, str],
+) -> None:
+    """Every datum that is read comes from the trigger or another vertex, with a fitting type."""
     for name, vertex in vertices.items():
         for port, datum in vertex.inputs.items():
             if datum in component.inputs and datum != component.trigger:
@@ -82,11 +99,19 @@ def declare_vertices(
                         f"{producers[datum]!r} gives {type_name(given)} as {datum!r}, "
                         f"but input {port!r} takes {type_name(wanted)}",
                     )
-    order = vertex_order(vertices.values(), component.inputs)
-    if len(order) < len(vertices):
-        stuck = _cycle([vertex for name, vertex in vertices.items() if name not in order])
-        raise file.error([*keys, "graph", stuck[0]], f"these vertices wait for each other in a cycle: {stuck}")
-    return [declared[name] for name in order]
+
+
+def _check_commits(
+    file: ConfigFile[ModuleSpec], keys: Sequence[str | int], declared: Mapping[str, DeclaredVertex]
+) -> None:
+    """Every output is committed once in a frame."""
+    committing: dict[str, str] = {}
+    for name, one in declared.items():
+        if isinstance(one.vertex.processor, CommitDagProcessor):
+            other = committing.setdefault(one.config.output, name)
+            if other != name:
+                message = f"output {one.config.output!r} is committed by vertex {other!r} already"
+                raise file.error([*keys, "graph", name, "config", "output"], message)
 
 
 def _cycle(stuck: list[Vertex]) -> list[str]:

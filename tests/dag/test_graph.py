@@ -108,6 +108,14 @@ def vertices(**data):
     return GOOD[: GOOD.index("      shout")] + graph
 
 
+def test_an_output_is_committed_by_one_vertex(write):
+    again = "      again: {processor: warploom.dag.CommitDagProcessor, in: {value: sum}, config: {output: text}}\n"
+    with pytest.raises(
+        ConfigError, match=r":24: .*again\.config\.output: output 'text' is committed by vertex 'commit'"
+    ):
+        declare(write(GOOD + again))
+
+
 def test_a_cycle_names_those_in_it_and_no_other(write):
     text = vertices(
         after=("c", "number", "d"), one=("c", "number", "a"), two=("a", "x", "b"), three=("b", "x", "c"),
