@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from shapely.geometry import Polygon
+
 from warploom.errors import SourceError
 from warploom.models.geometry import (
     KittiCalibration,

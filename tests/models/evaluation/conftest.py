@@ -9,6 +9,7 @@ import pathlib
 
 import numpy as np
 import pytest
+
 from warploom.models.evaluation.tracking import TrackTable
 from warploom.models.geometry import KittiCalibration, box_corners, invert, kitti_poses
 
@@ -34,7 +35,7 @@ class Sequence:
     """Numbers of all frames, in order."""
     boxes: list
     scores: list
-    """Detections for each of `frames`."""
+    """Detections for each of `frames`; the network's scores are logits, here brought into [0, 1]."""
     poses: np.ndarray
     """World from the renamed camera frame for each of `frames`."""
     dont_care: dict
@@ -103,7 +104,7 @@ def read(folder: pathlib.Path, name: str, kind: str) -> Sequence:
         truth=truth,
         frames=frames,
         boxes=[renamed(rows[:, 7:14]) for rows in each],
-        scores=[rows[:, 6] for rows in each],
+        scores=[1.0 / (1.0 + np.exp(-rows[:, 6])) for rows in each],
         poses=lidar_poses @ invert(calibration.rectified_from_lidar) @ AXES.T,
         dont_care=dont_care,
         projection=calibration.projection[2],
