@@ -1,0 +1,43 @@
+"""What the benchmarks share, and what is added to pytest-benchmark's JSON for the report."""
+
+import importlib.metadata
+import pathlib
+
+import pytest
+
+from warploom.bench.contest import Contest
+from warploom.bench.scans import Scans
+
+_PEERS = ("spconv", "small-gicp", "open3d", "pypatchworkpp", "scipy", "scikit-learn", "shapely")
+_skipped: dict[str, str] = {}
+
+
+@pytest.fixture(scope="session")
+def scans() -> Scans:
+    """The clouds, each made once."""
+    data = pathlib.Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+    return Scans(data if data.is_dir() else None)
+
+
+@pytest.fixture
+def contest(benchmark, scans) -> Contest:
+    """Times the contenders of a kernel."""
+    return Contest(benchmark, scans)
+
+
+def pytest_runtest_logreport(report):
+    if report.skipped and isinstance(report.longrepr, tuple):
+        _skipped[report.nodeid.rpartition("::")[2]] = report.longrepr[2].removeprefix("Skipped: ")
+
+
+def pytest_benchmark_update_json(config, benchmarks, output_json):
+    """The machine, the versions of the peers, and what was skipped for which reason."""
+    from warploom.components.machine import describe_machine
+
+    machine = describe_machine()
+    for package in _PEERS:
+        try:
+            machine["versions"][package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    output_json["warploom"] = {"machine": machine, "skipped": _skipped}

@@ -1,0 +1,150 @@
+"""The clouds that are timed: a simulated street in several sizes, and real scans where they lie beside the checkout."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..models.evaluation.ground import SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, GroundLabels
+
+if TYPE_CHECKING:
+    from ..models.simulator import SimulatedFrame
+
+__all__ = ["REAL", "SCANS", "LabelledScan", "Scans", "terrain_mesh"]
+
+REAL = "KITTI"
+"""The scan that is real: a full sweep of an HDL-64E, about 124 thousand points."""
+SCANS = ("street 10k", "street 120k", "street 500k", REAL)
+"""The clouds: every twelfth point of a simulated sweep of an HDL-64E, a whole one, four of them; a real one."""
+
+_SEED = 7
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScan:
+    """A scan whose ground is known."""
+
+    points: np.ndarray
+    """x y z [m] and intensity, shape (n, 4), float32."""
+    ground: np.ndarray
+    """True where a point is ground, shape (n,), bool."""
+    scored: np.ndarray
+    """True where a point counts for the score, shape (n,), bool."""
+
+
+class Scans:
+    """Makes and reads each cloud once."""
+
+    def __init__(self, data: Path | None):
+        """Says where the real scans are.
+
+        Args:
+            data: The folder of real data; None where there is none.
+        """
+        self._data = data
+        self._kept: dict[str, np.ndarray] = {}
+
+    @functools.cached_property
+    def street(self) -> list[SimulatedFrame]:
+        """Twenty sweeps of an HDL-64E that is driven along a simulated street, 10 a second."""
+        from ..models.simulator import Simulator
+
+        return list(Simulator(seed=_SEED, duration=2.0))
+
+    def cloud(self, name: str) -> np.ndarray:
+        """The cloud of this name, one of `SCANS`; shape (n, 4), float32.
+
+        Raises:
+            FileNotFoundError: It is the real one, and the real scans are not here.
+        """
+        if name not in self._kept:
+            self._kept[name] = np.ascontiguousarray(self._make(name), np.float32)
+        return self._kept[name]
+
+    def _make(self, name: str) -> np.ndarray:
+        if name == REAL:
+            return _read_bin(self._folder("semantic_kitti/full") / "08_000000.bin")
+        first = self.street[0]
+        if name == "street 10k":
+            return first.points[::12]
+        if name == "street 120k":
+            return first.points
+        if name != "street 500k":
+            raise ValueError(f"name must be one of {', '.join(SCANS)}, not {name!r}")
+        # Half a second of driving apart, all seen from the first sweep's sensor.
+        return np.concatenate([_seen_from(frame, first) for frame in self.street[::5]])
+
+    def _folder(self, name: str) -> Path:
+        if self._data is None or not (self._data / name).is_dir():
+            raise FileNotFoundError(f"the real scans (../shared/data/{name}) are not here")
+        return self._data / name
+
+    @functools.cached_property
+    def labelled(self) -> dict[str, list[LabelledScan]]:
+        """The scans whose ground is labelled, by set.
+
+        Raises:
+            FileNotFoundError: The real scans are not here.
+        """
+        full = self._folder("semantic_kitti/full")
+        images = self._folder("semantic_kitti/range_64x1024")
+        sets: dict[str, list[LabelledScan]] = {"full scans": [], "range images": []}
+        for path in sorted(full.glob("*.bin")):
+            whole, partial = path.with_suffix(".label"), path.with_suffix(".partial_label_u8")
+            if whole.exists():
+                labels, meaning = np.fromfile(whole, np.uint32) & 0xFFFF, SEMANTIC_KITTI
+            else:
+                labels, meaning = np.fromfile(partial, np.uint8), SEMANTIC_KITTI_TRAIN
+            sets["full scans"].append(_labelled(_read_bin(path), labels, meaning))
+        for path in sorted(images.glob("*.npz")):
+            image = np.load(path)
+            seen = image["depth"].ravel() > 0
+            points = np.column_stack([image["xyz"].reshape(-1, 3), image["intensity"].ravel()])[seen]
+            sets["range images"].append(_labelled(points, image["label"].ravel()[seen], SEMANTIC_KITTI_TRAIN))
+        return sets
+
+
+def _read_bin(path: Path) -> np.ndarray:
+    return np.fromfile(path, np.float32).reshape(-1, 4)
+
+
+def _labelled(points: np.ndarray, labels: np.ndarray, meaning: GroundLabels) -> LabelledScan:
+    return LabelledScan(np.ascontiguousarray(points, np.float32), *meaning.masks(labels))
+
+
+def _seen_from(frame: SimulatedFrame, other: SimulatedFrame) -> np.ndarray:
+    """The points of one frame in the sensor's frame of another, shape (n, 4)."""
+    pose = np.linalg.inv(other.pose) @ frame.pose
+    points = frame.points.copy()
+    points[:, :3] = points[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    return points
+
+
+def terrain_mesh(seed: int = _SEED) -> tuple[np.ndarray, np.ndarray]:
+    """A hilly ground with blocks of houses and cars on it: vertices [m], shape (v, 3), and faces, shape (f, 3)."""
+    random = np.random.default_rng(seed)
+    side, extent = 200, 100.0
+    steps = np.linspace(-extent, extent, side + 1)
+    x, y = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    z = 0.3 * np.sin(x / 9.0) * np.cos(y / 13.0) - 1.73
+    corner = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    quads = np.stack([corner, corner + side + 1, corner + side + 2, corner + 1], 1)
+    vertices, faces = [np.stack([x, y, z], 1)], [quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]
+    cube = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
+    cube_faces = np.array([
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ])  # fmt: skip
+    count = sum(len(v) for v in vertices)
+    for _ in range(600):
+        radius, angle = random.uniform(6.0, extent), random.uniform(0, 2 * np.pi)
+        size = random.uniform((0.5, 0.5, 1.0), (6.0, 6.0, 6.0))
+        centre = np.array([radius * np.cos(angle), radius * np.sin(angle), size[2] / 2 - 1.7])
+        vertices.append(cube * size + centre)
+        faces.append(cube_faces + count)
+        count += len(cube)
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32)
