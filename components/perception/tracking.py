@@ -35,6 +35,10 @@ class TrackingProcessor(Processor):
             velocities=detections.velocities,
             pose=sensor.pose,
         )
+        boxes = tracks.boxes.astype(np.float32)
+        # A cluster is as large as what is seen of it now: its track gives it an id, and its own box stays.
+        seen = tracks.background & (tracks.detections >= 0)
+        boxes[seen] = detections.boxes[tracks.detections[seen]]
         self.obstacles.value = Obstacles(
             version=sensor.version,
             frame=sensor.index,
@@ -43,7 +47,7 @@ class TrackingProcessor(Processor):
             ids=tracks.ids,
             classes=tracks.classes,
             scores=tracks.scores.astype(np.float32),
-            boxes=tracks.boxes.astype(np.float32),
+            boxes=boxes,
             velocities=tracks.velocities.astype(np.float32),
             background=tracks.background,
             missing_inputs=detected.missing_inputs,
