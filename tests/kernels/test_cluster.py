@@ -1,0 +1,209 @@
+"""Euclidean clustering against SciPy: the pairs of a KD-tree in float64, and the components of their graph."""
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from warploom.kernels.cluster import EuclideanCluster, cluster
+from warploom.kernels.interop import count_on
+
+
+def reference(points, radius, min_size=1):
+    """Labels by the lowest index, -1 for small components and points that are not finite."""
+    labels = np.full(len(points), -1, np.int32)
+    finite = np.flatnonzero(np.isfinite(points[:, :3]).all(axis=1))
+    if len(finite) == 0:
+        return labels
+    pairs = cKDTree(points[finite, :3].astype(np.float64)).query_pairs(radius, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (len(finite),) * 2)
+    component = connected_components(graph, directed=False)[1]
+    large = np.bincount(component)[component] >= min_size
+    _, first, inverse = np.unique(component[large], return_index=True, return_inverse=True)
+    order = np.empty(len(first), np.int32)
+    order[np.argsort(first)] = np.arange(len(first))
+    labels[finite[large]] = order[inverse]
+    return labels
+
+
+def launched(points, device="cpu", include=None, **fields):
+    """The labels of a plan, launched twice so that what the first left is met."""
+    plan = EuclideanCluster(capacity=max(len(points), 1), device=device, **fields)
+    for order in (points[::-1], points):
+        xyz = wp.array(np.ascontiguousarray(order[:, :3]), dtype=wp.vec3, device=device)
+        plan.launch(xyz, count_on(len(points), device), include)
+    labels = plan.labels.numpy()[: len(points)]
+    assert plan.cluster_count.numpy()[0] == labels.max(initial=-1) + 1
+    return labels
+
+
+def decoded(path):
+    """The positions of a packed KITTI scan (its README)."""
+    planes = np.load(path)["planes"].astype(np.int64)
+    u = planes[0] | planes[1] << 8 | planes[2] << 16
+    return (np.cumsum((u >> 1) ^ -(u & 1), axis=1).T / 1000).astype(np.float32)
+
+
+def scans(folder):
+    """One or two scans of each kind, whole."""
+    for path in sorted((folder / "kitti_object" / "velodyne").glob("*.bin"))[:2]:
+        yield path.name, np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+    yield "tracking", decoded(min((folder / "kitti_tracking" / "velodyne_packed").rglob("*.npz")))
+    yield "traffic", decoded(min((folder / "kitti_raw_traffic" / "velodyne_packed").rglob("*.npz")))
+    path = min((folder / "semantic_kitti" / "full").glob("08_*.bin"))
+    yield path.name, np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+    path = min((folder / "nuscenes_sample").glob("*.pcd.bin"))
+    yield path.name, np.fromfile(path, np.float32).reshape(-1, 5)[:, :3]
+    for kind in ("semantic_kitti/range_64x1024", "nuscenes_range_32x1024", "ika_vlp32_range_32x240"):
+        yield kind, np.load(min((folder / kind).glob("*.npz")))["xyz"].reshape(-1, 3)
+    yield "gndnet", np.load(min((folder / "gndnet" / "reduced_velo").glob("*.npy")))[:, :3]
+
+
+def test_scipys_partition_of_real_scans_without_the_ground(shared_data):
+    for name, points in scans(shared_data):
+        above = points[points[:, 2] > -1.4].astype(np.float32)[:12_000]
+        # A range image holds its missing returns as one crowd at the origin, which SciPy takes the square of.
+        above = above[np.any(above != 0, axis=1)]
+        np.testing.assert_array_equal(cluster(above, 0.5, 5), reference(above, 0.5, 5), err_msg=name)
+
+
+@pytest.mark.real
+def test_scipys_partition_of_thinned_whole_scans(shared_data):
+    for name, points in scans(shared_data):
+        points = points[np.any(points != 0, axis=1)].astype(np.float32)[::6]
+        np.testing.assert_array_equal(cluster(points, 0.5), reference(points, 0.5), err_msg=name)
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+@pytest.mark.parametrize("radius", [0.05, 0.4, 1.5, 200.0])
+def test_scipys_partition_of_a_random_cloud(device, method, radius):
+    points = np.random.default_rng(3).normal(0, [8, 8, 1.5], (1_500, 3)).astype(np.float32)
+    for min_size in (1, 4):
+        actual = launched(points, device, method=method, radius=radius, min_size=min_size)
+        np.testing.assert_array_equal(actual, reference(points, radius, min_size))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 200),
+    st.sampled_from([0.1, 0.25, 0.3, 0.5, 1.0]),
+    st.sampled_from([0.1, 0.25, 0.3, 0.5]),
+    st.sampled_from([0.0, 1000.0, -1e5]),
+)
+def test_pairs_at_just_the_radius_are_decided_as_in_float64(seed, n, radius, step, offset):
+    """Points of a grid are full of distances equal to the radius, but for the rounding of the coordinates."""
+    rng = np.random.default_rng(seed)
+    points = (rng.integers(-6, 7, (n, 3)) * step + offset).astype(np.float32)
+    expected = reference(points, radius, 2)
+    for method in ("in_order", "shared"):
+        np.testing.assert_array_equal(launched(points, method=method, radius=radius, min_size=2), expected)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 300))
+def test_order_of_points_does_not_change_the_partition(seed, n):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, 6, (n, 3)).astype(np.float32)
+    order = rng.permutation(n)
+    labels, shuffled = cluster(points, 0.5), cluster(points[order], 0.5)
+    assert len(set(zip(labels[order], shuffled, strict=True))) == labels.max() + 1 == shuffled.max() + 1
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(width=32)] * 3), max_size=40), st.sampled_from([1e-6, 0.5, 1e6]))
+def test_any_floats_at_all(rows, radius):
+    """NaN, infinities, denormals, and numbers whose squares overflow float32."""
+    points = np.array(rows, np.float32).reshape(-1, 3)
+    near = np.clip(points, -1e18, 1e18)  # SciPy's own squares stay finite
+    for method in ("in_order", "shared"):
+        np.testing.assert_array_equal(launched(near, method=method, radius=radius), reference(near, radius))
+        launched(points, method=method, radius=radius)
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_points_that_are_not_finite_or_not_included_get_no_label(device, method):
+    points = np.random.default_rng(5).uniform(0, 4, (500, 3)).astype(np.float32)
+    points[::50, 1] = np.nan
+    points[7] = np.inf, -np.inf, np.nan
+    mask = np.random.default_rng(6).uniform(size=500) < 0.6
+    left = points.copy()
+    left[~mask] = np.nan
+    for dtype in (wp.bool, wp.uint8):
+        # The first launch of two sees the points in reverse, the second as they are.
+        include = wp.array(mask.astype(wp.dtype_to_numpy(dtype)), dtype=dtype, device=device)
+        actual = launched(points, device, include, method=method, radius=0.4, min_size=2)
+        np.testing.assert_array_equal(actual, reference(left, 0.4, 2))
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_crowded_cells_do_not_take_the_square_of_their_points(method):
+    """A million points in one cell, and two crowds a hair farther apart than the radius, or a hair nearer."""
+    rng = np.random.default_rng(0)
+    crowd = rng.uniform(0, 0.2, (500_000, 3)).astype(np.float32)
+    assert launched(np.concatenate([crowd, crowd]), method=method, radius=0.5).max() == 0
+    for gap, clusters in ((0.501, 2), (0.499, 1)):
+        sheet = crowd[:200_000] * np.float32([0, 1, 1])
+        points = np.concatenate((sheet, sheet[::-1] + np.float32((gap, 0, 0))))
+        assert launched(points, method=method, radius=0.5).max() + 1 == clusters
+    ball = rng.normal(size=(10_000, 3))
+    ball *= 0.1 / np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.concatenate((ball, ball + np.array((0.51, 0.4, 0.3)))).astype(np.float32)
+    assert launched(points, method=method, radius=0.5).max() + 1 == 2
+
+
+def test_a_pole_of_many_cells():
+    """One column of cells, in no order: the sort by height does not take their square."""
+    points = np.zeros((200_000, 3), np.float32)
+    points[:, 2] = np.random.default_rng(0).permutation(200_000) * 0.5
+    assert cluster(points, 0.4).max() + 1 == 200_000
+    assert cluster(points, 0.6).max() + 1 == 1
+
+
+def test_far_from_the_origin():
+    points = np.random.default_rng(1).uniform(0, 30, (3_000, 3)) + np.array((1e5, -1e5, 50))
+    points = points.astype(np.float32)
+    for radius in (0.05, 0.5, 2.0):
+        np.testing.assert_array_equal(cluster(points, radius), reference(points, radius))
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_point_and_one_point(n):
+    labels = cluster(np.zeros((n, 3), np.float32), 0.5)
+    assert labels.dtype == np.int32
+    assert labels.tolist() == [0] * n
+
+
+def test_a_cluster_of_min_size_stays_and_a_smaller_one_goes():
+    points = np.array([[9, 0, 0], [0, 0, 0], [0.3, 0, 0], [5, 0, 0], [5.3, 0, 0], [5.6, 0, 0]], np.float32)
+    assert cluster(points, 0.5, 1).tolist() == [0, 1, 1, 2, 2, 2]
+    assert cluster(points, 0.5, 2).tolist() == [-1, 0, 0, 1, 1, 1]
+    assert cluster(points, 0.5, min_size=3).tolist() == [-1, -1, -1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0,), "radius must be a positive number"),
+        ((float("nan"),), "radius must be a positive number"),
+        ((float("inf"),), "radius must be a positive number"),
+        ((0.5, 0), "min_size must be at least 1"),
+    ],
+)
+def test_a_wrong_argument_is_refused_by_name(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        cluster(np.zeros((1, 3), np.float32), *arguments)
+
+
+def test_a_plan_refuses_what_does_not_fit():
+    plan = EuclideanCluster(radius=0.5, capacity=10)
+    with pytest.raises(ValueError, match="capacity of 10"):
+        plan.launch(wp.zeros(11, dtype=wp.vec3, device="cpu"), count_on(11, "cpu"))
+    with pytest.raises(ValueError, match="include must be bool or uint8 with at least 5 rows"):
+        plan.launch(wp.zeros(5, dtype=wp.vec3, device="cpu"), count_on(5, "cpu"), wp.zeros(4, wp.bool, device="cpu"))
+    with pytest.raises(ValueError, match="method must be"):
+        EuclideanCluster(radius=0.5, capacity=10, method="fast")

@@ -1,0 +1,111 @@
+"""Voxel downsampling against NumPy in double precision."""
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from warploom.kernels.downsample import VoxelDownsample, voxel_downsample
+from warploom.kernels.interop import count_on
+
+
+def reference(points, voxel_size):
+    """Centroids in order of first appearance, summed in float64."""
+    cells = np.floor(points[:, :3].astype(np.float32) * np.float32(1.0 / voxel_size)).astype(np.int64)
+    _, first, voxel = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    sums = np.zeros((len(first), 3))
+    np.add.at(sums, voxel.ravel(), points[:, :3].astype(np.float64))
+    return (sums / np.bincount(voxel.ravel())[:, None])[np.argsort(first)]
+
+
+def launched(points, device="cpu", **fields):
+    """The centroids and the dropped count of a plan, launched twice so that what the first left is met."""
+    plan = VoxelDownsample(capacity=max(len(points), 1), device=device, **fields)
+    for order in (points[::-1], points):
+        xyz = wp.array(np.ascontiguousarray(order[:, :3]), dtype=wp.vec3, device=device)
+        plan.launch(xyz, count_on(len(points), device))
+    return plan.centroids.numpy()[: int(plan.centroid_count.numpy()[0])], int(plan.dropped.numpy()[0])
+
+
+def street(seed, n=60_000):
+    return np.random.default_rng(seed).normal(0, [30, 30, 2, 1], (n, 4)).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+@pytest.mark.parametrize("voxel_size", [0.05, 0.2, 2.0])
+def test_matches_the_reference_on_a_street(device, method, voxel_size):
+    """Same voxels, same order; centroids within 2 float32 steps at 128 m and the 0.24 µm of the fixed point."""
+    points = street(7)
+    expected = reference(points, voxel_size)
+    actual, dropped = launched(points, device, method=method, voxel_size=voxel_size)
+    assert actual.shape == expected.shape
+    assert dropped == 0
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1.6e-5)
+    np.testing.assert_array_equal(actual, voxel_downsample(points, voxel_size))
+
+
+def test_matches_the_reference_on_real_scans(shared_data):
+    for path in sorted((shared_data / "kitti_object" / "velodyne").glob("*.bin"))[:3]:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        expected = reference(points, 0.2)
+        actual = voxel_downsample(points, 0.2)
+        assert actual.shape == expected.shape
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1.6e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 500))
+def test_order_of_points_does_not_change_the_set(seed, n):
+    """Shuffling the input gives the same centroids, to the bit, and either method does."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-5, 5, (n, 3)).astype(np.float32)
+    shuffled = points[rng.permutation(n)]
+    a, b = voxel_downsample(points, 0.5), voxel_downsample(shuffled, 0.5)
+    np.testing.assert_array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
+    np.testing.assert_array_equal(launched(shuffled, method="shared", voxel_size=0.5)[0], b)
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_points_that_are_not_finite_or_too_far_are_skipped_and_counted(method):
+    points = np.zeros((8, 3), np.float32)
+    points[1, 0], points[2, 1], points[3, 2] = np.nan, np.inf, -np.inf
+    points[4, 0] = 2.0**20
+    points[5] = -(2.0**20) + 1, 5, 5
+    points[6] = np.nan, np.inf, -np.inf
+    actual, dropped = launched(points, method=method, voxel_size=0.5)
+    np.testing.assert_array_equal(actual, [[0, 0, 0], [-(2.0**20) + 1, 5, 5]])
+    assert dropped == 5
+
+
+def test_a_million_points_in_one_voxel_far_away():
+    points = np.full((1_000_000, 3), 1e5, np.float32) + np.random.default_rng(0).uniform(0, 1, (1_000_000, 1)) * 0.4
+    points = points.astype(np.float32)
+    expected = reference(points, 10.0)
+    np.testing.assert_allclose(voxel_downsample(points, 10.0), expected, rtol=0, atol=0.008)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_point_and_one_point(n):
+    points = np.full((n, 3), 0.3, np.float32)
+    np.testing.assert_allclose(voxel_downsample(points, 1.0), points, atol=1e-6)
+
+
+def test_cells_below_zero_are_not_folded_onto_those_above():
+    points = np.array([[-0.1, 0, 0], [0.1, 0, 0], [-0.9, 0, 0]], np.float32)
+    np.testing.assert_allclose(voxel_downsample(points, 1.0), [[-0.5, 0, 0], [0.1, 0, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_size_that_is_not_positive_is_refused(size):
+    with pytest.raises(ValueError, match="voxel_size must be > 0"):
+        voxel_downsample(np.zeros((1, 3), np.float32), size)
+
+
+def test_a_plan_refuses_what_does_not_fit():
+    with pytest.raises(ValueError, match="capacity must be at least 1"):
+        VoxelDownsample(voxel_size=1.0, capacity=0)
+    with pytest.raises(ValueError, match="method must be"):
+        VoxelDownsample(voxel_size=1.0, capacity=1, method="fast")
+    with pytest.raises(ValueError, match="capacity of 10"):
+        VoxelDownsample(voxel_size=1.0, capacity=10).launch(wp.zeros(11, wp.vec3, device="cpu"), count_on(11, "cpu"))
