@@ -23,9 +23,10 @@ __all__ = ["BevMaps", "bev"]
 wp.set_module_options({"fuse_fp": False})
 
 _HEIGHT, _INTENSITY, _DENSITY = (wp.constant(i) for i in range(3))
+_HIGHEST, _COUNT = (wp.constant(i) for i in range(2))  # the columns of a cell
 _LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))
 _SIGN_BIAS = wp.constant(wp.int64(1 << 31))
-_LOG_FULL = wp.constant(math.log(64.0))
+_FULL = wp.constant(63)  # points of a cell whose density is one
 
 
 @wp.struct
@@ -44,12 +45,11 @@ def _raise_cells(
     count_in: wp.array(dtype=wp.int32),
     grid: _Grid,
     # in out: zero
-    highest: wp.array(dtype=wp.int64),
-    points: wp.array(dtype=wp.int32),
+    cells: wp.array2d(dtype=wp.int64),
     # out
     cell_out: wp.array(dtype=wp.int32),
 ):
-    """The cell of each point, −1 outside; per cell its highest point, the first of equals, and how many it has."""
+    """Per cell its highest point, the first of equals, and how many it has; the cell of each point that may be one."""
     i = wp.tid()
     if i >= count_in[0]:
         return
@@ -65,12 +65,13 @@ def _raise_cells(
     row = wp.min(int((p[0] - low[0]) * grid.cells_per_metre[0]), grid.rows - 1)
     column = wp.min(int((p[1] - low[1]) * grid.cells_per_metre[1]), grid.columns - 1)
     cell = row * grid.columns + column
-    cell_out[i] = cell
     # The bits of a float as an integer in the same order; adding zero makes −0 equal 0.
     bits = wp.cast(p[2] + 0.0, wp.int32)
     order = wp.int64(bits ^ ((bits >> 31) & 0x7FFFFFFF)) + _SIGN_BIAS
-    wp.atomic_max(highest, cell, (order << wp.int64(31)) | (_LOW_WORD - wp.int64(i)))
-    wp.atomic_add(points, cell, 1)
+    key = (order << wp.int64(31)) | (_LOW_WORD - wp.int64(i))
+    wp.atomic_add(cells, cell, _COUNT, wp.int64(1))
+    higher = wp.atomic_max(cells, cell, _HIGHEST, key) < key
+    cell_out[i] = wp.where(higher, cell, -1)
 
 
 @wp.kernel
@@ -80,9 +81,9 @@ def _draw_cells(
     intensity_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     cell_in: wp.array(dtype=wp.int32),
+    density_in: wp.array(dtype=wp.float32),
     # in out: left zero
-    highest: wp.array(dtype=wp.int64),
-    points: wp.array(dtype=wp.int32),
+    cells: wp.array2d(dtype=wp.int64),
     # in out: zero
     maps: wp.array2d(dtype=wp.float32),
 ):
@@ -93,14 +94,14 @@ def _draw_cells(
     cell = cell_in[i]
     if cell < 0:
         return
-    if (highest[cell] & _LOW_WORD) != _LOW_WORD - wp.int64(i):
+    if (cells[cell, _HIGHEST] & _LOW_WORD) != _LOW_WORD - wp.int64(i):
         return
     maps[_HEIGHT, cell] = xyz_in[i][2]
     if intensity_in:
         maps[_INTENSITY, cell] = intensity_in[i]
-    maps[_DENSITY, cell] = wp.min(1.0, wp.log(1.0 + float(points[cell])) / _LOG_FULL)
-    highest[cell] = wp.int64(0)
-    points[cell] = 0
+    maps[_DENSITY, cell] = density_in[wp.min(int(cells[cell, _COUNT]), _FULL)]
+    cells[cell, _HIGHEST] = wp.int64(0)
+    cells[cell, _COUNT] = wp.int64(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +145,9 @@ class BevMaps:
             object.__setattr__(self, name, value)
 
         keep("_grid", grid)
-        keep("_highest", wp.zeros(rows * columns, dtype=wp.int64, device=device))
-        keep("_points", wp.zeros(rows * columns, dtype=wp.int32, device=device))
+        keep("_cells", wp.zeros((rows * columns, 2), dtype=wp.int64, device=device))
+        density = np.log1p(np.arange(_FULL + 1)) / np.log(_FULL + 1)
+        keep("_density", wp.array(density, dtype=wp.float32, device=device))
         keep("_cell", wp.zeros(self.capacity, dtype=wp.int32, device=device))
         keep("maps", wp.zeros((3, rows, columns), dtype=wp.float32, device=device))
         keep("_flat", self.maps.reshape((3, rows * columns)))
@@ -169,14 +171,14 @@ class BevMaps:
         wp.launch(
             _raise_cells,
             n,
-            inputs=[xyz, count, self._grid, self._highest, self._points],
+            inputs=[xyz, count, self._grid, self._cells],
             outputs=[self._cell],
             device=self.device,
         )
         wp.launch(
             _draw_cells,
             n,
-            inputs=[xyz, intensity, count, self._cell, self._highest, self._points, maps],
+            inputs=[xyz, intensity, count, self._cell, self._density, self._cells, maps],
             device=self.device,
         )
 

@@ -25,7 +25,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _SAMPLES = wp.constant(64)
 _EDGE = wp.constant(0.01)  # [m] nearer to an edge than this is no better
-_TICKS = wp.constant(10000.0)  # per metre: extents are integers, so that the order of points does not matter
+_FAR = wp.constant(1.0e30)
 _AREA = wp.constant(1)
 _METHODS = {
     # name: (criterion, directions in a quarter turn); the first look takes every fourth
@@ -188,8 +188,8 @@ def _sample_extremes(
                 sample_out[cluster, 4 * quarter + k] = wp.vec2(q[0], q[1])
         return
     d = direction_in[quarter * direction_in.shape[0] / (_SAMPLES / 4)]
-    low = wp.vec2(1.0e30, 1.0e30)
-    high = wp.vec2(-1.0e30, -1.0e30)
+    low = wp.vec2(_FAR, _FAR)
+    high = wp.vec2(-_FAR, -_FAR)
     for k in range(size):
         p = xyz_in[order_in[first + k]] - origin
         along = d[0] * p[0] + d[1] * p[1]
@@ -226,11 +226,10 @@ def _score(
         d = direction[(first + lane * step + directions) % directions]
         cos[lane] = d[0]
         sin[lane] = d[1]
-    far = float(1.0e30)
-    low_along = _vec8(far)
-    low_across = _vec8(far)
-    high_along = _vec8(-far)
-    high_across = _vec8(-far)
+    low_along = _vec8(_FAR)
+    low_across = _vec8(_FAR)
+    high_along = _vec8(-_FAR)
+    high_across = _vec8(-_FAR)
     for k in range(size):
         p = sample[cluster, k]
         along = cos * p[0] + sin * p[1]
@@ -285,7 +284,7 @@ def _choose_directions(
     # out
     chosen_out: wp.array(dtype=wp.int32),
     origin_out: wp.array(dtype=wp.vec3),
-    reach_out: wp.array2d(dtype=wp.int32),
+    reach_out: wp.array2d(dtype=wp.float32),
 ):
     """The best of the directions about the best of the first look; of equals the first. Clears the reach."""
     cluster = wp.tid()
@@ -293,7 +292,7 @@ def _choose_directions(
     chosen_out[cluster] = 0
     if size == 0:
         return
-    best = float(-1.0e30)
+    best = float(-_FAR)
     wide = int(0)
     for group in range(wide_in.shape[1]):
         scores = wide_in[cluster, group]
@@ -303,7 +302,7 @@ def _choose_directions(
                 wide = group * _LANES + lane
     first = wide * _STRIDE - 4
     close = _score(sample_in, cluster, size, direction_in, first, 1, criterion)
-    best = float(-1.0e30)
+    best = float(-_FAR)
     chosen = int(0)
     for lane in range(8):
         if close[lane] > best:
@@ -313,17 +312,16 @@ def _choose_directions(
     chosen_out[cluster] = (chosen + directions) % directions
     origin_out[cluster] = xyz_in[order_in[start_in[cluster]]]
     for side in range(6):
-        reach_out[cluster, side] = -2147483647
+        reach_out[cluster, side] = -_FAR
 
 
 @wp.func
-def _widen(reach: wp.array2d(dtype=wp.int32), cluster: int, side: int, distance: float):
+def _widen(reach: wp.array2d(dtype=wp.float32), cluster: int, side: int, distance: float):
     """Most points widen nothing: a look is cheaper than an atomic."""
-    ticks = int(wp.rint(_TICKS * wp.clamp(distance, -2.0e5, 2.0e5)))
-    if ticks > reach[cluster, side]:
-        wp.atomic_max(reach, cluster, side, ticks)
-    if -ticks > reach[cluster, side + 1]:
-        wp.atomic_max(reach, cluster, side + 1, -ticks)
+    if distance > reach[cluster, side]:
+        wp.atomic_max(reach, cluster, side, distance)
+    if -distance > reach[cluster, side + 1]:
+        wp.atomic_max(reach, cluster, side + 1, -distance)
 
 
 @wp.kernel
@@ -336,7 +334,7 @@ def _measure_reach(
     chosen_in: wp.array(dtype=wp.int32),
     origin_in: wp.array(dtype=wp.vec3),
     # in out
-    reach: wp.array2d(dtype=wp.int32),
+    reach: wp.array2d(dtype=wp.float32),
 ):
     """How far the points of each cluster reach from its first: forward, back, left, right, up, down."""
     i = wp.tid()
@@ -362,7 +360,7 @@ def _write_boxes(
     direction_in: wp.array(dtype=wp.vec2),
     chosen_in: wp.array(dtype=wp.int32),
     origin_in: wp.array(dtype=wp.vec3),
-    reach_in: wp.array2d(dtype=wp.int32),
+    reach_in: wp.array2d(dtype=wp.float32),
     min_size: float,
     # out
     boxes_out: wp.array2d(dtype=wp.float32),
@@ -376,8 +374,8 @@ def _write_boxes(
     middle = wp.vec3()
     size = wp.vec3()
     for axis in range(3):
-        ahead = float(reach_in[cluster, 2 * axis]) / _TICKS
-        behind = float(reach_in[cluster, 2 * axis + 1]) / _TICKS
+        ahead = reach_in[cluster, 2 * axis]
+        behind = reach_in[cluster, 2 * axis + 1]
         middle[axis] = 0.5 * (ahead - behind)
         size[axis] = wp.max(ahead + behind, min_size)
     d = direction_in[chosen_in[cluster]]
@@ -449,7 +447,7 @@ class FitBoxes:
         buffer("_wide", (clusters, directions // int(_STRIDE * _LANES)), _vec8)
         buffer("_chosen", clusters, wp.int32)
         buffer("_origin", clusters, wp.vec3)
-        buffer("_reach", (clusters, 6), wp.int32)
+        buffer("_reach", (clusters, 6), wp.float32)
         buffer("boxes", (clusters, 7), wp.float32)
         buffer("cluster_count", 1, wp.int32)
         buffer("dropped", 2, wp.int32)
@@ -519,8 +517,8 @@ def fit_boxes(points: Any, labels: Any, *, method: str = "l_shape", min_size: fl
 
     Returns:
         A box per label: centre x y z, length width height [m], yaw about z from x in (−π/2, π/2] [rad], length ≥ width;
-        shape (k, 7), float32, of the family and on the device of `points`. All points that are finite lie within, to
-        0.1 mm. A label without such points gets NaN.
+        shape (k, 7), float32, of the family and on the device of `points`. All points that are finite lie within,
+        to rounding. A label without such points gets NaN.
 
     Raises:
         TypeError: `points` is not a floating array, or `labels` not one of integers.

@@ -10,7 +10,6 @@ surface of its cell: strictly where something stands on the cell, loosely where 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
+from .ground_plane import FIRST_RING, RING_BITS, RINGS, SEGMENTS, GroundPlane, above, cell_of, lowest_point
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
 
@@ -27,31 +27,13 @@ __all__ = ["Ground", "GroundSegment", "elevation_grid", "segment_ground"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-# The polar grid. A ring is an eighth of an octave of r², so its width is 3 to 6 % of its radius: the float's own bits
-# name it. Segments divide the diamond |x| + |y| = 1 evenly, so they are 0.9 to 1.8° wide.
-_SEGMENTS = wp.constant(256)
-_RINGS = wp.constant(128)
-_RING_BITS = wp.constant(20)
-_FIRST_RING = wp.constant(127 * 8)  # the upper bits of 1 m²
-_FARTHEST = wp.constant(65536.0)  # r² where the last ring ends
-
-# The patches whose lowest points the plane is fitted to: 32 sectors, 8 octaves of r² from 2 to 32 m.
-_BANDS = wp.constant(8)
-_CANDIDATES = wp.constant(256)
-_FIRST_BAND_RING = wp.constant(16)
-_HYPOTHESES = wp.constant(128)
-_DRAWS = wp.constant(64)
-_NOWHERE = wp.constant(1.0e9)
-_STEEPEST = wp.constant(0.35)  # slope of the plane against the sensor, tan 19°
-_HEIGHT_SLACK = wp.constant(0.5)  # [m] between the height given and the plane found
-_DEFAULT_HEIGHT = wp.constant(1.8)
-
 # The sweep.
 _START = wp.constant(2.5)  # [m] from the sensor, where the plane itself is the last sample
 _STEP = wp.constant(0.2)  # [m] a sample may lie off the prediction, a kerb
 _STEP_PER_METRE = wp.constant(0.03)  # and more after a gap
 _SLOPE_MEMORY = wp.constant(1.0)  # [m] of way in which the slope is learnt
 _SLOPE_LIMIT = wp.constant(0.12)  # of the surface against the plane
+_NONE = wp.constant(1.0e9)
 _EXTEND = wp.constant(2.0)  # [m] that the last slope holds beyond the last sample
 
 # The verdict.
@@ -63,200 +45,7 @@ _TOP_BARE = wp.constant(0.32)  # [m] up to which points are ground on a bare cel
 _TOP_OCCUPIED = wp.constant(0.07)  # and on one where something stands
 _BOTTOM = wp.constant(0.3)  # [m] below which a point is noise
 _BOTTOM_PER_METRE = wp.constant(0.02)
-
-_HASH = wp.constant(wp.uint32(2654435761))
-_LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))
-_FIX = wp.constant(wp.float64(1048576.0))
-
-
-@wp.func
-def _cell_of(x: float, y: float) -> int:
-    """The polar cell of a position: segment × rings + ring."""
-    # The angle as the diamond's, 0 to 4: monotone in the true one, for one division.
-    angle = x / (wp.abs(x) + wp.abs(y) + 1.0e-30)
-    angle = wp.where(y < 0.0, 3.0 + angle, 1.0 - angle)
-    segment = int(angle * (float(_SEGMENTS) * 0.25)) & (_SEGMENTS - 1)
-    ring = (wp.cast(x * x + y * y, wp.int32) >> _RING_BITS) - _FIRST_RING
-    return segment * _RINGS + wp.clamp(ring, 0, _RINGS - 1)
-
-
-@wp.kernel
-def _bin_points(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    # in out: zero
-    cells: wp.array2d(dtype=wp.int64),
-    # out
-    cell_out: wp.array(dtype=wp.int32),
-):
-    """The cell of each point; per cell its lowest point, and the levels of 0.25 m (modulo 16 m) that have points."""
-    i = wp.tid()
-    if i >= count_in[0]:
-        return
-    p = xyz_in[i]
-    if not (wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) < 3.0e38):
-        cell_out[i] = -1
-        return
-    cell = _cell_of(p[0], p[1])
-    cell_out[i] = cell
-    z = wp.clamp(p[2], -999.0, 999.0)
-    depth = wp.int64(int((1000.0 - z) * 1000.0))
-    wp.atomic_max(cells, cell, 0, (depth << wp.int64(32)) | (_LOW_WORD - wp.int64(i)))
-    level = int((1000.0 + z) * 4.0) & 63
-    wp.atomic_or(cells, cell, 1, wp.int64(1) << wp.int64(level))
-
-
-@wp.func
-def _lowest_point(xyz: wp.array(dtype=wp.vec3), key: wp.int64) -> wp.vec3:
-    return xyz[int(_LOW_WORD - (key & _LOW_WORD))]
-
-
-@wp.kernel
-def _pick_candidates(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    cells_in: wp.array2d(dtype=wp.int64),
-    # out
-    candidate_out: wp.array(dtype=wp.vec3),
-):
-    """The lowest point of each patch around the sensor."""
-    patch = wp.tid()
-    sector = patch / _BANDS
-    band = patch % _BANDS
-    best = wp.int64(0)
-    for s in range(8):
-        for k in range(8):
-            best = wp.max(best, cells_in[(sector * 8 + s) * _RINGS + _FIRST_BAND_RING + band * 8 + k, 0])
-    if best == wp.int64(0):
-        candidate_out[patch] = wp.vec3(0.0, 0.0, _NOWHERE)
-    else:
-        candidate_out[patch] = _lowest_point(xyz_in, best)
-
-
-@wp.func
-def _above(plane: wp.vec3, p: wp.vec3) -> float:
-    """The height of a point above the plane z = a x + b y + c."""
-    return p[2] - plane[0] * p[0] - plane[1] * p[1] - plane[2]
-
-
-@wp.func
-def _plane_tolerance(p: wp.vec3) -> float:
-    return 0.1 + 0.01 * wp.sqrt(p[0] * p[0] + p[1] * p[1])
-
-
-@wp.func
-def _hypothesis(candidates: wp.array(dtype=wp.vec3), number: int) -> wp.vec3:
-    """The plane a b c through three candidates drawn by a fixed hash; c is nowhere if they give none."""
-    state = wp.uint32(number) * _HASH + wp.uint32(12345)
-    p = wp.vec3(0.0, 0.0, _NOWHERE)
-    q = wp.vec3(0.0, 0.0, _NOWHERE)
-    s = wp.vec3(0.0, 0.0, _NOWHERE)
-    drawn = wp.int32(0)
-    while drawn < _DRAWS and s[2] == _NOWHERE:
-        drawn += 1
-        state = state * wp.uint32(1664525) + wp.uint32(1013904223)
-        candidate = candidates[int(state >> wp.uint32(24))]
-        if candidate[2] != _NOWHERE:
-            if p[2] == _NOWHERE:
-                p = candidate
-            elif q[2] == _NOWHERE:
-                if wp.length(candidate - p) > 3.0:
-                    q = candidate
-            else:
-                area = (q[0] - p[0]) * (candidate[1] - p[1]) - (q[1] - p[1]) * (candidate[0] - p[0])
-                if wp.abs(area) > 12.0:
-                    s = candidate
-    if s[2] == _NOWHERE:
-        return s
-    normal = wp.cross(q - p, s - p)
-    a = -normal[0] / normal[2]
-    b = -normal[1] / normal[2]
-    return wp.vec3(a, b, p[2] - a * p[0] - b * p[1])
-
-
-@wp.kernel
-def _vote_planes(
-    # in
-    candidate_in: wp.array(dtype=wp.vec3),
-    sensor_height: float,
-    # in out: zero
-    best: wp.array(dtype=wp.int64),
-):
-    """Scores a hypothesis by the candidates on it, less those under it."""
-    number = wp.tid()
-    plane = _hypothesis(candidate_in, number)
-    if plane[2] == _NOWHERE or plane[0] * plane[0] + plane[1] * plane[1] > _STEEPEST * _STEEPEST:
-        return
-    if wp.abs(plane[2] + sensor_height) > _HEIGHT_SLACK:  # never where the height is not given, NaN
-        return
-    score = wp.int32(0)
-    for j in range(_CANDIDATES):
-        p = candidate_in[j]
-        off = _above(plane, p)
-        if wp.abs(off) < _plane_tolerance(p):
-            score += 2
-        elif off < 0.0:
-            score -= 1
-    if score > 0:
-        wp.atomic_max(best, 0, (wp.int64(score) << wp.int64(32)) | wp.int64(_HYPOTHESES - number))
-
-
-@wp.kernel
-def _sum_inliers(
-    # in
-    candidate_in: wp.array(dtype=wp.vec3),
-    best_in: wp.array(dtype=wp.int64),
-    # in out: zero
-    sums: wp.array(dtype=wp.int64),
-):
-    """Normal equations of the least-squares plane through the winner's candidates, in fixed point."""
-    if best_in[0] == wp.int64(0):
-        return
-    plane = _hypothesis(candidate_in, _HYPOTHESES - int(best_in[0] & _LOW_WORD))
-    p = candidate_in[wp.tid()]
-    off = _above(plane, p)
-    if wp.abs(off) < _plane_tolerance(p):
-        x = wp.float64(p[0])
-        y = wp.float64(p[1])
-        z = wp.float64(off)
-        wp.atomic_add(sums, 0, wp.int64(1))
-        wp.atomic_add(sums, 1, wp.int64(x * _FIX))
-        wp.atomic_add(sums, 2, wp.int64(y * _FIX))
-        wp.atomic_add(sums, 3, wp.int64(z * _FIX))
-        wp.atomic_add(sums, 4, wp.int64(x * x * _FIX))
-        wp.atomic_add(sums, 5, wp.int64(x * y * _FIX))
-        wp.atomic_add(sums, 6, wp.int64(y * y * _FIX))
-        wp.atomic_add(sums, 7, wp.int64(x * z * _FIX))
-        wp.atomic_add(sums, 8, wp.int64(y * z * _FIX))
-
-
-@wp.func
-def _fitted_plane(
-    candidates: wp.array(dtype=wp.vec3),
-    best: wp.array(dtype=wp.int64),
-    sums: wp.array(dtype=wp.int64),
-    sensor_height: float,
-) -> wp.vec3:
-    """The plane of the ground near the sensor, or the level one at the height given or usual if none was found."""
-    if best[0] == wp.int64(0):
-        return wp.vec3(0.0, 0.0, -wp.where(wp.isnan(sensor_height), _DEFAULT_HEIGHT, sensor_height))
-    plane = _hypothesis(candidates, _HYPOTHESES - int(best[0] & _LOW_WORD))
-    n = wp.float64(sums[0]) * _FIX
-    x = wp.float64(sums[1]) / n
-    y = wp.float64(sums[2]) / n
-    z = wp.float64(sums[3]) / n
-    xx = wp.float64(sums[4]) / n - x * x
-    xy = wp.float64(sums[5]) / n - x * y
-    yy = wp.float64(sums[6]) / n - y * y
-    xz = wp.float64(sums[7]) / n - x * z
-    yz = wp.float64(sums[8]) / n - y * z
-    determinant = xx * yy - xy * xy
-    if determinant < wp.float64(1.0):
-        return plane
-    a = (xz * yy - yz * xy) / determinant
-    b = (yz * xx - xz * xy) / determinant
-    return plane + wp.vec3(float(a), float(b), float(z - a * x - b * y))
+_FARTHEST = wp.constant(65536.0)  # r² where the last ring ends
 
 
 @wp.kernel
@@ -264,35 +53,27 @@ def _sweep_segments(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     cells_in: wp.array2d(dtype=wp.int64),
-    candidate_in: wp.array(dtype=wp.vec3),
-    best_in: wp.array(dtype=wp.int64),
-    sums_in: wp.array(dtype=wp.int64),
+    plane_in: wp.array(dtype=wp.vec3),
     radius_in: wp.array(dtype=wp.float32),
-    sensor_height: float,
     # out
-    plane_out: wp.array(dtype=wp.vec3),
-    sensor_height_out: wp.array(dtype=wp.float32),
     rise_out: wp.array(dtype=wp.float32),
 ):
     """Walks a segment outwards over its samples; out: how far the surface rises above the plane in each cell."""
     segment = wp.tid()
-    plane = _fitted_plane(candidate_in, best_in, sums_in, sensor_height)
-    if segment == 0:
-        plane_out[0] = plane
-        sensor_height_out[0] = -plane[2] / wp.sqrt(1.0 + plane[0] * plane[0] + plane[1] * plane[1])
-    first = segment * _RINGS
+    plane = plane_in[0]
+    first = segment * RINGS
     last_r = wp.float32(_START)
     last_rise = wp.float32(0.0)
     slope = wp.float32(0.0)
-    below_rise = wp.float32(_NOWHERE)  # of the last sample that lay too low
+    below_rise = wp.float32(_NONE)  # of the last sample that lay too low
     below_r = wp.float32(0.0)
     filled = wp.int32(0)  # the rings before this one have their rise
-    for ring in range(_RINGS):
+    for ring in range(RINGS):
         key = cells_in[first + ring, 0]
         if key != wp.int64(0):
-            p = _lowest_point(xyz_in, key)
+            p = lowest_point(xyz_in, key)
             r = wp.sqrt(p[0] * p[0] + p[1] * p[1])
-            rise = _above(plane, p)
+            rise = above(plane, p)
             run = wp.max(r - last_r, 0.05)
             off = rise - last_rise - slope * run
             taken = wp.abs(off) <= _STEP + _STEP_PER_METRE * run
@@ -316,8 +97,8 @@ def _sweep_segments(
                 slope += run / (run + _SLOPE_MEMORY) * (steepness - slope)
                 last_rise = rise
                 last_r = r
-                below_rise = _NOWHERE
-    for k in range(filled, _RINGS):
+                below_rise = _NONE
+    for k in range(filled, RINGS):
         rise_out[first + k] = last_rise + slope * wp.clamp(radius_in[k] - last_r, 0.0, _EXTEND)
 
 
@@ -331,18 +112,18 @@ def _median5(a: float, b: float, c: float, d: float, e: float) -> float:
 @wp.func
 def _reconciled(rise: wp.array(dtype=wp.float32), radius: wp.array(dtype=wp.float32), cell: int) -> wp.vec2:
     """The rise in the middle of a cell, held to the median across segments, and its gradient outwards."""
-    last = _SEGMENTS * _RINGS - 1
+    last = SEGMENTS * RINGS - 1
     own = rise[cell]
     median = _median5(
-        rise[(cell - 2 * _RINGS) & last],
-        rise[(cell - _RINGS) & last],
+        rise[(cell - 2 * RINGS) & last],
+        rise[(cell - RINGS) & last],
         own,
-        rise[(cell + _RINGS) & last],
-        rise[(cell + 2 * _RINGS) & last],
+        rise[(cell + RINGS) & last],
+        rise[(cell + 2 * RINGS) & last],
     )
-    ring = cell & (_RINGS - 1)
+    ring = cell & (RINGS - 1)
     inner = wp.max(ring - 1, 0)
-    outer = wp.min(ring + 1, _RINGS - 1)
+    outer = wp.min(ring + 1, RINGS - 1)
     gradient = (rise[cell - ring + outer] - rise[cell - ring + inner]) / (radius[outer] - radius[inner])
     return wp.vec2(
         wp.clamp(own, median - _OFF_MEDIAN, median + _OFF_MEDIAN),
@@ -366,7 +147,7 @@ def _judge_cells(
     if cells_in[cell, 0] == wp.int64(0):
         return
     surface = _reconciled(rise_in, radius_in, cell)
-    r = radius_in[cell & (_RINGS - 1)]
+    r = radius_in[cell & (RINGS - 1)]
     centre = centre_in[cell]
     plane = plane_in[0]
     z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
@@ -403,7 +184,7 @@ def _judge_points(
     p = xyz_in[i]
     surface = surface_in[cell]
     r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
-    height = _above(plane_in[0], p) - surface[0] - surface[1] * r2
+    height = above(plane_in[0], p) - surface[0] - surface[1] * r2
     height_out[i] = height
     mask_out[i] = height < surface[2] and height > surface[3]
 
@@ -423,8 +204,8 @@ def _sample_elevation(
     row, column = wp.tid()  # pyright: ignore[reportAssignmentType]
     x = low[0] + (float(row) + 0.5) * cell_size
     y = low[1] + (float(column) + 0.5) * cell_size
-    cell = _cell_of(x, y)
-    r = radius_in[cell & (_RINGS - 1)]
+    cell = cell_of(x, y)
+    r = radius_in[cell & (RINGS - 1)]
     surface = _reconciled(rise_in, radius_in, cell)
     plane = plane_in[0]
     rise = surface[0] + 0.5 * surface[1] / r * (wp.min(x * x + y * y, _FARTHEST) - r * r)
@@ -458,41 +239,32 @@ class GroundSegment:
     """z of the ground in the middle of each square, row = x, column = y, float32; filled by `launch_elevation`."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
-        if self.sensor_height is not None and not math.isfinite(self.sensor_height):
-            raise ValueError(f"sensor_height must be finite [m] or None, not {self.sensor_height}")
         if not self.cell_size > 0:
             raise ValueError(f"cell_size must be > 0 m, not {self.cell_size}")
         xmin, ymin, xmax, ymax = self.grid_range
         if not (xmin < xmax and ymin < ymax):
             raise ValueError(f"grid_range must be xmin ymin xmax ymax with min < max, not {self.grid_range}")
+        fit = GroundPlane(capacity=self.capacity, sensor_height=self.sensor_height, device=self.device)
         device = resolve_device(self.device)
         squares = (max(1, round((xmax - xmin) / self.cell_size)), max(1, round((ymax - ymin) / self.cell_size)))
 
-        def keep(name: str, array: wp.array) -> None:
-            object.__setattr__(self, name, array)
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
 
         def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
             keep(name, wp.zeros(shape, dtype=dtype, device=device))
 
-        size = int(_SEGMENTS * _RINGS)
+        size = int(SEGMENTS * RINGS)
         radius, centre = _grid_centres()
+        keep("_fit", fit)
+        keep("plane", fit.plane)
+        keep("found_height", fit.found_height)
         keep("_radius", wp.array(radius, dtype=wp.float32, device=device))
         keep("_centre", wp.array(centre, dtype=wp.vec2, device=device))
-        # One array of what each launch clears: per cell two words, the best hypothesis, the sums of the fit.
-        buffer("_scratch", 2 * size + 10, wp.int64)
-        keep("_cells", self._scratch[: 2 * size].reshape((size, 2)))
-        keep("_best", self._scratch[2 * size : 2 * size + 1])
-        keep("_sums", self._scratch[2 * size + 1 :])
-        buffer("_cell", self.capacity, wp.int32)
-        buffer("_candidate", int(_CANDIDATES), wp.vec3)
         buffer("_rise", size, wp.float32)
         buffer("_surface", size, wp.vec4)
         buffer("mask", self.capacity, wp.bool)
         buffer("height", self.capacity, wp.float32)
-        buffer("found_height", 1, wp.float32)
-        buffer("plane", 1, wp.vec3)
         buffer("elevation", squares, wp.float32)
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
@@ -517,37 +289,23 @@ class GroundSegment:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _launch_into(self, xyz: wp.array, count: wp.array, mask: wp.array, height: wp.array) -> None:
-        n = xyz.shape[0]
-        if n > self.capacity:
-            raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
-        given = math.nan if self.sensor_height is None else self.sensor_height
-        self._scratch.zero_()
-        self._run(_bin_points, n, [xyz, count, self._cells], [self._cell])
-        # The plane near the sensor.
-        self._run(_pick_candidates, int(_CANDIDATES), [xyz, self._cells], [self._candidate])
-        self._run(_vote_planes, int(_HYPOTHESES), [self._candidate, given, self._best], [])
-        self._run(_sum_inliers, int(_CANDIDATES), [self._candidate, self._best, self._sums], [])
-        # The surface over it.
-        self._run(
-            _sweep_segments,
-            int(_SEGMENTS),
-            [xyz, self._cells, self._candidate, self._best, self._sums, self._radius, given],
-            [self.plane, self.found_height, self._rise],
-        )
+        fit = self._fit
+        fit.launch(xyz, count)
+        self._run(_sweep_segments, int(SEGMENTS), [xyz, fit.cells, fit.plane, self._radius], [self._rise])
         self._run(
             _judge_cells,
-            int(_SEGMENTS * _RINGS),
-            [self._cells, self._rise, self._radius, self._centre, self.plane],
+            int(SEGMENTS * RINGS),
+            [fit.cells, self._rise, self._radius, self._centre, fit.plane],
             [self._surface],
         )
-        self._run(_judge_points, n, [xyz, count, self._cell, self.plane, self._surface], [mask, height])
+        self._run(_judge_points, xyz.shape[0], [xyz, count, fit.cell, fit.plane, self._surface], [mask, height])
 
 
 def _grid_centres() -> tuple[np.ndarray, np.ndarray]:
     """The radius in the middle of each ring, and the middle of each cell."""
-    bits = (np.arange(_RINGS, dtype=np.int32) + _FIRST_RING << _RING_BITS) + (1 << (_RING_BITS - 1))
+    bits = (np.arange(RINGS, dtype=np.int32) + FIRST_RING << RING_BITS) + (1 << (RING_BITS - 1))
     radius = np.sqrt(bits.astype(np.int32).view(np.float32))
-    angle = (np.arange(_SEGMENTS) + 0.5) * (4 / _SEGMENTS)
+    angle = (np.arange(SEGMENTS) + 0.5) * (4 / SEGMENTS)
     x = np.where(angle < 2, 1 - angle, angle - 3)
     y = np.where(angle < 2, 1, -1) * (1 - np.abs(x))
     directions = np.stack([x, y], axis=1) / np.hypot(x, y)[:, None]
