@@ -157,9 +157,9 @@ def _kernels(results: list[Result]) -> Iterator[str]:
         "## Kernels beside their peers",
         "",
         "Medians. *Function* is the whole call: NumPy in and NumPy out on the CPU, arrays of the device elsewhere; "
-        "*plan* is the preallocated launch alone. Ours uses one CPU thread. The ratio is our function's time over the "
-        "peer's. A peer gets its input in the type it likes best, converted before the clock starts; † marks a time of "
-        "the peer's own timer, which leaves its bindings out.",
+        "*plan* is the preallocated launch alone. Ours uses one CPU thread. The ratio is our function's time, or the "
+        "plan's where there is no function, over the peer's. A peer gets its input in the type it likes best, converted "
+        "before the clock starts; † marks a time of the peer's own timer, which leaves its bindings out.",
         "",
     )
     kernels = dict.fromkeys(result.kernel for result in results)
@@ -180,12 +180,13 @@ def _rows_of(results: list[Result]) -> Iterator[tuple[str, ...]]:
         peers = [result for result in here if result.who not in (_OURS, _PLAN)]
         for device in dict.fromkeys((*ours, *plans)):
             function, plan = ours.get(device), plans.get(device)
+            own = function or plan
             first = (on, f"{size:,}", device, _milliseconds(function), _milliseconds(plan))
             own_accuracy = function.accuracy if function else ""
             if not peers:
                 yield (*first, "", "", "", "", "", "", own_accuracy)
             for peer in peers:
-                ratio = function.seconds / peer.seconds if function else None
+                ratio = own.seconds / peer.seconds
                 goal = peer.goal if device == "cpu" else None
                 accuracy = "; theirs: ".join(text for text in (own_accuracy, peer.accuracy) if text)
                 yield (
@@ -193,9 +194,9 @@ def _rows_of(results: list[Result]) -> Iterator[tuple[str, ...]]:
                     peer.who,
                     str(peer.threads),
                     _milliseconds(peer) + (" †" if peer.self_timed else ""),
-                    "" if ratio is None else _share(ratio),
+                    _share(ratio),
                     "" if goal is None else f"≤ {_share(goal)}",
-                    "" if goal is None or ratio is None else _yes(ratio <= goal),
+                    "" if goal is None else _yes(ratio <= goal),
                     accuracy,
                 )
 
