@@ -158,7 +158,7 @@ def _kernels(results: list[Result]) -> Iterator[str]:
         "",
         "Medians. *Function* is the whole call: NumPy in and NumPy out on the CPU, arrays of the device elsewhere; "
         "*plan* is the preallocated launch alone. Ours uses one CPU thread. The ratio is our function's time, or the "
-        "plan's where there is no function, over the peer's. A peer gets its input in the type it likes best, converted "
+        "plan's where there is no function, over the peer's. A peer gets its input in the type it likes, converted "
         "before the clock starts; † marks a time of the peer's own timer, which leaves its bindings out.",
         "",
     )
