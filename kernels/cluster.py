@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .cell_pairs import Radius, cell_of, differ, find, hash_cell, is_finite, radius_of, touch, unite
+from .cluster_columns import gather_cells_in_order, join_in_order, label_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -23,475 +25,8 @@ __all__ = ["EuclideanCluster", "cluster"]
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_LARGEST_CELL = wp.constant(wp.float64(2.0**30))
-_SPREAD = wp.constant(wp.uint32(0x9E3779B1))
 _NO_POINT = wp.constant(wp.int32(2**31 - 1))
-_BRUTE_FORCE = wp.constant(wp.int64(4096))  # pairs of points up to which nothing beats trying them all
 _SMALLEST_RADIUS = 1e-8
-_FEW = wp.constant(16)  # cells of a column that an insertion sort takes
-
-
-@wp.struct
-class _Radius:
-    inverse_side: wp.float64  # of a cell
-    surely: wp.float32  # squared distances in float32 up to here are within the radius whatever the rounding
-    surely_not: wp.float32  # and above here they are not
-    squared: wp.float64
-
-
-# ---- cells
-
-
-@wp.func
-def _cell_along(coordinate: float, inverse_side: wp.float64) -> int:
-    """The cell's index along an axis; where float32 has no neighbours within a cell any more, the number's own bits."""
-    scaled = wp.float64(coordinate) * inverse_side
-    cell = int(0)
-    if wp.abs(scaled) < _LARGEST_CELL:
-        cell = int(wp.floor(scaled))
-    elif coordinate > 0.0:
-        cell = wp.cast(coordinate, wp.int32)
-    else:
-        cell = -wp.cast(-coordinate, wp.int32)
-    return cell
-
-
-@wp.func
-def _cell_of(point: wp.vec3, radius: _Radius) -> wp.vec3i:
-    return wp.vec3i(
-        _cell_along(point[0], radius.inverse_side),
-        _cell_along(point[1], radius.inverse_side),
-        _cell_along(point[2], radius.inverse_side),
-    )
-
-
-@wp.func
-def _is_finite(point: wp.vec3) -> bool:
-    return (point[0] - point[0]) + (point[1] - point[1]) + (point[2] - point[2]) == 0.0
-
-
-@wp.func
-def _differ(a: wp.vec3i, b: wp.vec3i) -> bool:
-    return a[0] != b[0] or a[1] != b[1] or a[2] != b[2]
-
-
-@wp.func
-def _hash_cell(cell: wp.vec3i) -> int:
-    """Blocks of 4 × 4 × 2 cells are spread over the table; within one, neighbours in space share cache lines."""
-    block = (
-        wp.uint32(cell[0] >> 2) * wp.uint32(73856093)
-        ^ wp.uint32(cell[1] >> 2) * wp.uint32(19349669)
-        ^ wp.uint32(cell[2] >> 1) * wp.uint32(83492791)
-    )
-    within = ((cell[0] & 3) << 3) | ((cell[1] & 3) << 1) | (cell[2] & 1)
-    return int((((block * _SPREAD) >> wp.uint32(7)) << wp.uint32(5)) & wp.uint32(0x3FFFFFE0)) | within
-
-
-@wp.func
-def _hash_column(x: int, y: int) -> int:
-    """Tiles of 512 × 512 columns are spread over the table; within one, neighbours in space share cache lines."""
-    tile = wp.uint32(x >> 9) * wp.uint32(73856093) ^ wp.uint32(y >> 9) * wp.uint32(19349669)
-    return int(((tile * _SPREAD) ^ wp.uint32((x & 511) * 512 + (y & 511))) & wp.uint32(0x3FFFFFFF))
-
-
-# ---- pairs of cells
-
-
-@wp.func
-def _is_near(p: wp.vec3, q: wp.vec3, radius: _Radius) -> bool:
-    """Whether the distance is within the radius, as float64 decides; float32 does where it is sure to agree."""
-    x = p[0] - q[0]
-    y = p[1] - q[1]
-    z = p[2] - q[2]
-    squared = x * x + y * y + z * z
-    near = squared <= radius.surely
-    if squared > radius.surely and squared <= radius.surely_not:
-        dx = wp.float64(p[0]) - wp.float64(q[0])
-        dy = wp.float64(p[1]) - wp.float64(q[1])
-        dz = wp.float64(p[2]) - wp.float64(q[2])
-        near = dx * dx + dy * dy + dz * dz <= radius.squared
-    return near
-
-
-@wp.func
-def _gap_squared(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> float:
-    """The squared distance of a point to a box."""
-    gap = wp.max(wp.max(low - p, p - high), wp.vec3(0.0))
-    return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]
-
-
-@wp.func
-def _touch_large(
-    points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: _Radius
-) -> bool:
-    """As `_touch`, for crowded cells: narrows both sides to what lies near the other's box before it tries pairs."""
-    infinite = float(wp.inf)
-    a_low = wp.vec3(-infinite)
-    a_high = wp.vec3(infinite)
-    b_low = wp.vec3(-infinite)
-    b_high = wp.vec3(infinite)
-    a_left = a_end - a_begin
-    b_left = b_end - b_begin
-    for _ in range(8):
-        low = wp.vec3(infinite)
-        high = wp.vec3(-infinite)
-        left = int(0)
-        for i in range(a_begin, a_end):
-            p = points[i]
-            if _gap_squared(p, b_low, b_high) <= radius.surely_not:
-                low = wp.min(low, p)
-                high = wp.max(high, p)
-                left += 1
-        narrowed = left < a_left
-        a_low = low
-        a_high = high
-        a_left = left
-        low = wp.vec3(infinite)
-        high = wp.vec3(-infinite)
-        left = int(0)
-        for j in range(b_begin, b_end):
-            q = points[j]
-            if _gap_squared(q, a_low, a_high) <= radius.surely_not:
-                low = wp.min(low, q)
-                high = wp.max(high, q)
-                left += 1
-        narrowed = narrowed or left < b_left
-        b_low = low
-        b_high = high
-        b_left = left
-        if a_left == 0 or b_left == 0:
-            return False
-        if not narrowed and _ > 0:
-            break
-    for i in range(a_begin, a_end):
-        p = points[i]
-        if _gap_squared(p, b_low, b_high) <= radius.surely_not:
-            for j in range(b_begin, b_end):
-                if _is_near(p, points[j], radius):
-                    return True
-    return False
-
-
-@wp.func
-def _touch(
-    points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: _Radius
-) -> bool:
-    """Whether any point of one cell is within the radius of any point of another."""
-    if wp.int64(a_end - a_begin) * wp.int64(b_end - b_begin) > _BRUTE_FORCE:
-        return _touch_large(points, a_begin, a_end, b_begin, b_end, radius)
-    for i in range(a_begin, a_end):
-        p = points[i]
-        for j in range(b_begin, b_end):
-            if _is_near(p, points[j], radius):
-                return True
-    return False
-
-
-@wp.func
-def _find(parent: wp.array(dtype=wp.int32), cell: int) -> int:
-    """The root of a cell. Halves the path; a write lost to another thread leaves an ancestor all the same."""
-    root = int(cell)
-    above = parent[root]
-    while above != root:
-        next = parent[above]
-        parent[root] = next
-        root = next
-        above = parent[root]
-    return root
-
-
-@wp.func
-def _unite(parent: wp.array(dtype=wp.int32), a: int, b: int):
-    """Joins two components; the lower root stays, so that it is the lowest cell of its component in the end."""
-    low = _find(parent, a)
-    high = _find(parent, b)
-    while low != high:
-        if low > high:
-            swap = low
-            low = high
-            high = swap
-        found = wp.atomic_cas(parent, high, high, low)
-        if found == high:
-            high = low
-        else:
-            # Another thread was first: go on from where it hung the root.
-            high = _find(parent, found)
-            low = _find(parent, low)
-
-
-# ---- one thread, in order
-
-
-@wp.func
-def _sort_by_height(stack: wp.array(dtype=wp.vec2i), begin: int, end: int):
-    """Shell sort, which for the few cells of most columns is an insertion sort."""
-    gap = int(1)
-    if end - begin > _FEW:
-        while gap < (end - begin) // 3:
-            gap = gap * 3 + 1
-    while gap > 0:
-        for i in range(begin + gap, end):
-            moving = stack[i]
-            place = int(i)
-            while place >= begin + gap and stack[place - gap][0] > moving[0]:
-                stack[place] = stack[place - gap]
-                place -= gap
-            stack[place] = moving
-        gap = gap // 3
-
-
-@wp.kernel
-def _gather_cells_in_order(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    include_in: wp.array(dtype=wp.uint8),
-    has_include: int,
-    radius: _Radius,
-    # in out: tables of cells and of columns, -1 where free
-    cell_table: wp.array(dtype=wp.int32),
-    column_table: wp.array(dtype=wp.int32),
-    # out
-    cell_of_point: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=wp.vec3i),
-    cell_slot: wp.array(dtype=wp.int32),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    cell_column: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.vec4i),
-    column_slot: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    stack: wp.array(dtype=wp.vec2i),
-    sizes: wp.array(dtype=wp.int32),
-):
-    """Numbers cells by their lowest point, lists the points of each cell, and by height the cells of each column."""
-    cell_mask = cell_table.shape[0] - 1
-    column_mask = column_table.shape[0] - 1
-    cell_count = int(0)
-    column_count = int(0)
-    c = int(-1)
-    before = wp.vec3i(0, 0, 0)
-    n = wp.min(count_in[0], xyz_in.shape[0])
-    for i in range(n):
-        point = xyz_in[i]
-        usable = _is_finite(point)
-        if usable and has_include != 0:
-            usable = include_in[i] != wp.uint8(0)
-        if usable:
-            cell = _cell_of(point, radius)
-            # Neighbours in a scan are mostly neighbours in space: often it is the cell of the point before.
-            if c < 0 or _differ(cell, before):
-                before = cell
-                slot = _hash_cell(cell) & cell_mask
-                c = cell_table[slot]
-                while c >= 0 and _differ(cells[c], cell):
-                    slot = (slot + 1) & cell_mask
-                    c = cell_table[slot]
-                if c < 0:
-                    c = cell_count
-                    cell_count += 1
-                    cell_table[slot] = c
-                    cell_slot[c] = slot
-                    cells[c] = cell
-                    cell_end[c] = 0
-                    parent[c] = c
-                    slot = _hash_column(cell[0], cell[1]) & column_mask
-                    k = column_table[slot]
-                    while k >= 0 and (columns[k][0] != cell[0] or columns[k][1] != cell[1]):
-                        slot = (slot + 1) & column_mask
-                        k = column_table[slot]
-                    if k < 0:
-                        k = column_count
-                        column_count += 1
-                        column_table[slot] = k
-                        column_slot[k] = slot
-                        columns[k] = wp.vec4i(cell[0], cell[1], 0, 0)
-                    cell_column[c] = k
-                    columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
-            cell_of_point[i] = c
-            cell_end[c] = cell_end[c] + 1
-        else:
-            cell_of_point[i] = -1
-    # From sizes to where each begins; the end then moves as it is filled.
-    begin = int(0)
-    for k in range(column_count):
-        column = columns[k]
-        columns[k] = wp.vec4i(column[0], column[1], begin, begin)
-        begin += column[3]
-    begin = int(0)
-    for v in range(cell_count):
-        cell_begin[v] = begin
-        begin += cell_end[v]
-        cell_end[v] = cell_begin[v]
-        k = cell_column[v]
-        stack[columns[k][3]] = wp.vec2i(cells[v][2], v)
-        columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
-    for i in range(n):
-        v = cell_of_point[i]
-        if v >= 0:
-            end = cell_end[v]
-            points[end] = xyz_in[i]
-            cell_end[v] = end + 1
-    for k in range(column_count):
-        _sort_by_height(stack, columns[k][2], columns[k][3])
-    sizes[0] = cell_count
-    sizes[1] = column_count
-
-
-@wp.func
-def _join_stacks(
-    stack: wp.array(dtype=wp.vec2i),
-    begin: int,
-    end: int,
-    other_begin: int,
-    other_end: int,
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    radius: _Radius,
-    parent: wp.array(dtype=wp.int32),
-):
-    """Unites the cells of two columns that touch; of a column and itself, where the two begin alike."""
-    low = int(other_begin)
-    for s in range(begin, end):
-        z = stack[s][0]
-        a = stack[s][1]
-        if begin == other_begin:
-            low = s + 1
-        while low < other_end and stack[low][0] < z - 2:
-            low += 1
-        t = int(low)
-        while t < other_end and stack[t][0] <= z + 2:
-            b = stack[t][1]
-            if parent[a] != parent[b]:
-                root_a = _find(parent, a)
-                root_b = _find(parent, b)
-                if root_a != root_b and _touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
-                    parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
-            t += 1
-
-
-@wp.kernel
-def _join_in_order(
-    # in
-    column_table: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.vec4i),
-    stack: wp.array(dtype=wp.vec2i),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=wp.int32),
-    offsets: wp.array(dtype=wp.vec2i),
-    near_offsets: int,
-    radius: _Radius,
-    # in out: roots of columns that are of one component, else -1
-    parent: wp.array(dtype=wp.int32),
-    column_root: wp.array(dtype=wp.int32),
-):
-    """Unites cells of a column and of neighbouring columns, the adjacent first: they leave little to the others."""
-    mask = column_table.shape[0] - 1
-    for k in range(sizes[1]):
-        column_root[k] = -1
-        begin = columns[k][2]
-        end = columns[k][3]
-        _join_stacks(stack, begin, end, begin, end, cell_begin, cell_end, points, radius, parent)
-    for ring in range(2):
-        first = int(0)
-        last = int(near_offsets)
-        if ring == 1:
-            first = near_offsets
-            last = offsets.shape[0]
-        for k in range(sizes[1]):
-            here = columns[k]
-            root = column_root[k]
-            for o in range(first, last):
-                x = here[0] + offsets[o][0]
-                y = here[1] + offsets[o][1]
-                slot = _hash_column(x, y) & mask
-                other = column_table[slot]
-                while other >= 0:
-                    there = columns[other]
-                    if there[0] == x and there[1] == y:
-                        if root < 0 or column_root[other] != root:
-                            _join_stacks(
-                                stack,
-                                here[2],
-                                here[3],
-                                there[2],
-                                there[3],
-                                cell_begin,
-                                cell_end,
-                                points,
-                                radius,
-                                parent,
-                            )
-                        other = -1
-                    else:
-                        slot = (slot + 1) & mask
-                        other = column_table[slot]
-        for c in range(sizes[0]):
-            parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
-        if ring == 0:
-            for k in range(sizes[1]):
-                begin = columns[k][2]
-                root = parent[stack[begin][1]]
-                for s in range(begin + 1, columns[k][3]):
-                    if parent[stack[s][1]] != root:
-                        root = -1
-                column_root[k] = root
-
-
-@wp.kernel
-def _label_in_order(
-    # in
-    count_in: wp.array(dtype=wp.int32),
-    cell_of_point: wp.array(dtype=wp.int32),
-    cell_slot: wp.array(dtype=wp.int32),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    column_slot: wp.array(dtype=wp.int32),
-    sizes: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    min_size: int,
-    # in out: tables left free; members left as labels
-    cell_table: wp.array(dtype=wp.int32),
-    column_table: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    # out
-    labels_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-):
-    """Counts each component's points, numbers those with enough, and hands the numbers to the points."""
-    for c in range(sizes[0]):
-        cell_table[cell_slot[c]] = -1
-        root = parent[c]
-        if root == c:
-            members[c] = 0
-        members[root] = members[root] + cell_end[c] - cell_begin[c]
-    for k in range(sizes[1]):
-        column_table[column_slot[k]] = -1
-    clusters = int(0)
-    for c in range(sizes[0]):
-        root = parent[c]
-        if root == c:
-            # Of a root nothing but its label is wanted from here on.
-            label = int(-1)
-            if members[c] >= min_size:
-                label = clusters
-                clusters += 1
-            members[c] = label
-        else:
-            members[c] = members[root]
-    for i in range(labels_out.shape[0]):
-        label = int(-1)
-        if i < count_in[0] and cell_of_point[i] >= 0:
-            label = members[cell_of_point[i]]
-        labels_out[i] = label
-    cluster_count_out[0] = clusters
-
-
-# ---- many threads
 
 
 @wp.kernel
@@ -501,7 +36,7 @@ def _claim_cells(
     count_in: wp.array(dtype=wp.int32),
     include_in: wp.array(dtype=wp.uint8),
     has_include: int,
-    radius: _Radius,
+    radius: Radius,
     # in out: a table of points that stand for their cells, -1 where free; lowest points and sizes
     table: wp.array(dtype=wp.int32),
     lowest: wp.array(dtype=wp.int32),
@@ -517,15 +52,15 @@ def _claim_cells(
     if i >= count_in[0]:
         return
     point = xyz_in[i]
-    if not _is_finite(point):
+    if not is_finite(point):
         return
     if has_include != 0 and include_in[i] == wp.uint8(0):
         return
-    cell = _cell_of(point, radius)
+    cell = cell_of(point, radius)
     mask = table.shape[0] - 1
-    slot = _hash_cell(cell) & mask
+    slot = hash_cell(cell) & mask
     found = wp.atomic_cas(table, slot, -1, i)
-    while found >= 0 and _differ(_cell_of(xyz_in[wp.max(found, 0)], radius), cell):
+    while found >= 0 and differ(cell_of(xyz_in[wp.max(found, 0)], radius), cell):
         slot = (slot + 1) & mask
         found = wp.atomic_cas(table, slot, -1, i)
     slot_of_point[i] = slot
@@ -558,7 +93,7 @@ def _number_cells(
     head_in: wp.array(dtype=wp.int32),
     rank_in: wp.array(dtype=wp.int32),
     size: wp.array(dtype=wp.int32),
-    radius: _Radius,
+    radius: Radius,
     # out
     cell_of_slot: wp.array(dtype=wp.int32),
     cells: wp.array(dtype=wp.vec3i),
@@ -576,7 +111,7 @@ def _number_cells(
     slot = slot_of_point[i]
     c = rank_in[i] - 1
     cell_of_slot[slot] = c
-    cells[c] = _cell_of(xyz_in[i], radius)
+    cells[c] = cell_of(xyz_in[i], radius)
     cell_size[c] = size[slot]
     parent[c] = c
     members[c] = 0
@@ -612,27 +147,27 @@ def _join_cells(
     points: wp.array(dtype=wp.vec3),
     cell_count: wp.array(dtype=wp.int32),
     offsets: wp.array(dtype=wp.vec3i),
-    radius: _Radius,
+    radius: Radius,
     # in out
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites a cell with one of its neighbours, if they touch."""
-    o, a = wp.tid()
+    o, a = wp.tid()  # pyright: ignore[reportAssignmentType]
     if a >= cell_count[0]:
         return
     wanted = cells[a] + offsets[o]
     mask = table.shape[0] - 1
-    slot = _hash_cell(wanted) & mask
+    slot = hash_cell(wanted) & mask
     while table[slot] >= 0:
         b = cell_of_slot[slot]
-        if _differ(cells[b], wanted):
+        if differ(cells[b], wanted):
             slot = (slot + 1) & mask
         else:
-            if _find(parent, a) != _find(parent, b):
+            if find(parent, a) != find(parent, b):
                 a_begin = cell_begin[a]
                 b_begin = cell_begin[b]
-                if _touch(points, a_begin, a_begin + cell_size[a], b_begin, b_begin + cell_size[b], radius):
-                    _unite(parent, a, b)
+                if touch(points, a_begin, a_begin + cell_size[a], b_begin, b_begin + cell_size[b], radius):
+                    unite(parent, a, b)
             return
 
 
@@ -647,7 +182,7 @@ def _count_members(
 ):
     c = wp.tid()
     if c < cell_count[0]:
-        wp.atomic_add(members, _find(parent, c), cell_size[c])
+        wp.atomic_add(members, find(parent, c), cell_size[c])
 
 
 @wp.kernel
@@ -691,16 +226,13 @@ def _label_points(
     label = int(-1)
     slot = slot_of_point[i]
     if slot >= 0:
-        root = _find(parent, cell_of_slot[slot])
+        root = find(parent, cell_of_slot[slot])
         if head_in[root] == 1:
             label = rank_in[root] - 1
         table[slot] = -1
         lowest[slot] = _NO_POINT
         size[slot] = 0
     labels_out[i] = label
-
-
-# ---- the public faces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -745,12 +277,7 @@ class EuclideanCluster:
             for name in names:
                 keep(name, wp.empty(self.capacity, dtype=dtype, device=device))
 
-        radius = _Radius()
-        # A hair shorter, so that no rounding makes the diagonal longer than the radius.
-        radius.inverse_side = math.sqrt(3.0) / (self.radius * (1.0 - 1e-6))
-        radius.squared = self.radius * self.radius
-        radius.surely, radius.surely_not = radius.squared * (1.0 - 1e-6), radius.squared * (1.0 + 1e-6)
-        keep("_radius", radius)
+        keep("_radius", radius_of(self.radius))
         keep("_sequential", sequential)
         keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
         keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
@@ -812,7 +339,7 @@ class EuclideanCluster:
             wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
 
         run(
-            _gather_cells_in_order,
+            gather_cells_in_order,
             given,
             [
                 *(*tables, self._cell_of_point, self._cells, self._cell_slot, *cell_ends, self._cell_column),
@@ -820,7 +347,7 @@ class EuclideanCluster:
             ],
         )
         run(
-            _join_in_order,
+            join_in_order,
             [
                 *(self._column_table, self._columns, self._stack, *cell_ends, self._points, self._sizes),
                 *(self._offsets, self._near_offsets, self._radius),
@@ -828,7 +355,7 @@ class EuclideanCluster:
             [self._parent, self._column_root],
         )
         run(
-            _label_in_order,
+            label_in_order,
             [
                 *(given[1], self._cell_of_point, self._cell_slot, *cell_ends, self._column_slot),
                 *(self._sizes, self._parent, self.min_size),

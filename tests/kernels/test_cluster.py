@@ -41,6 +41,10 @@ def launched(points, device="cpu", include=None, **fields):
     return labels
 
 
+def cloud(seed, n=500):
+    return np.random.default_rng(seed).normal(0, [20, 20, 2], (n, 3)).astype(np.float32)
+
+
 def decoded(path):
     """The positions of a packed KITTI scan (its README)."""
     planes = np.load(path)["planes"].astype(np.int64)
@@ -207,3 +211,18 @@ def test_a_plan_refuses_what_does_not_fit():
         plan.launch(wp.zeros(5, dtype=wp.vec3, device="cpu"), count_on(5, "cpu"), wp.zeros(4, wp.bool, device="cpu"))
     with pytest.raises(ValueError, match="method must be"):
         EuclideanCluster(radius=0.5, capacity=10, method="fast")
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_a_captured_launch_replays_on_other_points(device, method):
+    plan = EuclideanCluster(radius=2.0, capacity=500, device=device, method=method)
+    xyz = wp.array(cloud(20), dtype=wp.vec3, device=device)
+    count = count_on(500, device)
+    plan.launch(xyz, count)
+    with wp.ScopedCapture(device=device) as capture:
+        plan.launch(xyz, count)
+    xyz.assign(cloud(21))
+    wp.capture_launch(capture.graph)
+    replayed = plan.labels.numpy().copy()
+    plan.launch(xyz, count)
+    np.testing.assert_array_equal(plan.labels.numpy(), replayed)

@@ -109,3 +109,18 @@ def test_a_plan_refuses_what_does_not_fit():
         VoxelDownsample(voxel_size=1.0, capacity=1, method="fast")
     with pytest.raises(ValueError, match="capacity of 10"):
         VoxelDownsample(voxel_size=1.0, capacity=10).launch(wp.zeros(11, wp.vec3, device="cpu"), count_on(11, "cpu"))
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_a_captured_launch_replays_on_other_points(device, method):
+    plan = VoxelDownsample(voxel_size=2.0, capacity=500, device=device, method=method)
+    xyz = wp.array(street(20, 500)[:, :3], dtype=wp.vec3, device=device)
+    count = count_on(500, device)
+    plan.launch(xyz, count)
+    with wp.ScopedCapture(device=device) as capture:
+        plan.launch(xyz, count)
+    xyz.assign(street(21, 500)[:, :3])
+    wp.capture_launch(capture.graph)
+    replayed = plan.centroids.numpy().copy()
+    plan.launch(xyz, count)
+    np.testing.assert_array_equal(plan.centroids.numpy(), replayed)

@@ -198,3 +198,18 @@ def test_a_plan_refuses_what_does_not_fit():
         plan.launch(xyz[:5], count_on(5, "cpu"))
     with pytest.raises(ValueError, match="method must be"):
         Voxelize(voxel_size=PILLAR, point_range=RANGE, capacity=10, method="fast")
+
+
+@pytest.mark.parametrize("method", ["in_order", "sort"])
+def test_a_captured_launch_replays_on_other_points(device, method):
+    plan = Voxelize(voxel_size=PILLAR, point_range=RANGE, columns=3, capacity=500, device=device, method=method)
+    xyz = wp.array(street(20, 500)[:, :3], dtype=wp.vec3, device=device)
+    count = count_on(500, device)
+    plan.launch(xyz, count)
+    with wp.ScopedCapture(device=device) as capture:
+        plan.launch(xyz, count)
+    xyz.assign(street(21, 500)[:, :3])
+    wp.capture_launch(capture.graph)
+    replayed = plan.features.numpy().copy()
+    plan.launch(xyz, count)
+    np.testing.assert_array_equal(plan.features.numpy(), replayed)
