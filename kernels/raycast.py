@@ -1,8 +1,9 @@
 """LiDAR ray casting: beams against instanced triangle meshes, and what a sensor makes of the echoes.
 
 Two levels of bounding volumes: one over the instances of a scene, rebuilt whenever they move, and one a mesh, built
-once. A ray is carried into the frame of each instance it may hit, so a thousand parked cars cost as little memory as one.
-Every face has a label: its material in the low byte (reflectivity, share of light that passes through), its class above.
+once. A ray is carried into the frame of each instance it may
+hit, so a thousand parked cars cost as little memory as one.
+Every face has a label: its material in the low byte, its class above.
 
 All that looks like chance (glass that lets a beam through, noise, lost echoes) is a hash of seed and beam, so the
 same scene gives the same bytes again.
@@ -16,10 +17,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .device import resolve_device
 from .interop import borrow, family_of, give
+from .meshes import MeshSet
 
-__all__ = ["MATERIALS", "LidarCast", "MeshSet", "RayHits", "raycast"]
+__all__ = ["MATERIALS", "LidarCast", "RayHits", "raycast"]
 
 MATERIALS = 256
 """Rows of a table of materials; the low byte of a face's label names its row."""
@@ -29,7 +30,7 @@ _HASH_0, _HASH_1, _HASH_2, _HASH_3 = (
 )
 _MATERIAL_MASK = wp.constant(MATERIALS - 1)
 _CLASS_SHIFT = wp.constant(8)
-_REFLECTIVITY, _POROSITY, _LOSS, _GLOSS = (wp.constant(i) for i in range(4))
+_REFLECTIVITY, _POROSITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in range(5))
 # A beam passes at most this many porous faces of one instance: panes, leaves, meshes of a fence.
 _MAX_PASSES = wp.constant(6)
 _STEP = wp.constant(1.0e-3)  # [m] beyond a porous face, where the beam goes on
@@ -48,10 +49,17 @@ def _uniform(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
 
 @wp.func
 def _gauss(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
-    """A standard normal number, by Box and Muller."""
-    u = wp.max(_uniform(seed, a, b), 1.0e-7)
-    v = _uniform(seed + wp.uint32(1), a, b)
-    return wp.sqrt(-2.0 * wp.log(u)) * wp.cos(6.2831853 * v)
+    """A nearly normal number, within ± 3.5: the sum of four uniform ones, which needs no logarithm and no cosine."""
+    u = _uniform(seed, a, b) + _uniform(seed + wp.uint32(1), a, b)
+    v = _uniform(seed + wp.uint32(2), a, b) + _uniform(seed + wp.uint32(3), a, b)
+    return (u + v - 2.0) * 1.7320508
+
+
+@wp.func
+def _turn(pose_in: wp.array(dtype=wp.transform), fraction: float) -> wp.quat:
+    """The sensor's attitude within a sweep: between two near quaternions a chord does for the arc."""
+    start = wp.transform_get_rotation(pose_in[0])
+    return wp.normalize(start + fraction * (wp.transform_get_rotation(pose_in[1]) - start))
 
 
 @wp.kernel
@@ -81,7 +89,7 @@ def _cast(
     f = fraction_in[i]
     start = wp.transform_get_translation(pose_in[0])
     end = wp.transform_get_translation(pose_in[1])
-    turn = wp.quat_slerp(wp.transform_get_rotation(pose_in[0]), wp.transform_get_rotation(pose_in[1]), f)
+    turn = _turn(pose_in, f)
     origin = start + f * (end - start)
     direction = wp.normalize(wp.quat_rotate(turn, beams_in[i]))
     seed = seed_in[0]
@@ -165,7 +173,7 @@ def _sense(
     d = distance_in[i]
     if d < min_range or hit_label_in[i] < 0:
         return
-    turn = wp.quat_slerp(wp.transform_get_rotation(pose_in[0]), wp.transform_get_rotation(pose_in[1]), fraction_in[i])
+    turn = _turn(pose_in, fraction_in[i])
     cosine = wp.abs(wp.dot(wp.quat_rotate(turn, beams_in[i]), normal_in[i]))
     material = hit_label_in[i] & _MATERIAL_MASK
     seed = seed_in[0] ^ wp.uint32(0x5BD1E995)
@@ -174,18 +182,25 @@ def _sense(
     gloss = material_in[material, _GLOSS]
     # Rough surfaces send back more at a grazing angle than Lambert's law says; glossy paint has a lobe as well.
     texture = 1.0 + 0.2 * _gauss(seed, k, wp.uint32(1))
-    slant = wp.pow(cosine, 0.7)
-    echo = reflectivity * texture * ((1.0 - gloss) * slant + gloss * wp.pow(cosine, 8.0))
-    # The signal falls with the square of the range: it is 1 at `reach` for a tenth of full reflectivity, face on.
+    root = wp.sqrt(cosine)
+    slant = root * wp.sqrt(root)
+    square = cosine * cosine
+    lobe = gloss * square * square * square * square
+    echo = reflectivity * texture * ((1.0 - gloss) * slant + lobe)
+    # The signal falls with the square of the range: it is 1 at `reach` for a tenth of full reflectivity, face on,
+    # and there half of the echoes are seen.
     signal = echo / (d * d) * (reach * reach) * 10.0
-    seen = 1.0 / (1.0 + wp.pow(wp.max(signal, 1.0e-6), -3.0))
+    cube = signal * signal * signal
+    seen = cube / (1.0 + cube)
     chance = _uniform(seed, k, wp.uint32(3))
     if chance > seen * (1.0 - drop_out) * (1.0 - material_in[material, _LOSS]):
         return
     kept_out[i] = 1
-    range_out[i] = wp.max(d + range_noise * _gauss(seed, k, wp.uint32(5)), min_range)
+    roughness = material_in[material, _ROUGHNESS]
+    spread = wp.sqrt(range_noise * range_noise + roughness * roughness)
+    range_out[i] = wp.max(d + spread * _gauss(seed, k, wp.uint32(7)), min_range)
     # What is reported is compensated for range and in part for the angle, as sensors do.
-    reported = reflectivity * texture * ((1.0 - gloss) * (0.5 + 0.5 * cosine) + gloss * wp.pow(cosine, 8.0))
+    reported = reflectivity * texture * ((1.0 - gloss) * (0.5 + 0.5 * cosine) + lobe)
     intensity_out[i] = wp.clamp(reported, 0.0, 1.0)
 
 
@@ -222,104 +237,6 @@ def _compact(
     t_out[k] = beam_time_in[i]
     point_class_out[k] = hit_label_in[i] >> _CLASS_SHIFT
     instance_out[k] = hit_instance_in[i]
-
-
-class MeshSet:
-    """Triangle meshes with a label for each face; a mesh is added once and then named by its number."""
-
-    def __init__(self, device: str = "cpu", max_faces: int = 1 << 20):
-        self.device = resolve_device(device)
-        self.labels = wp.zeros(max_faces, dtype=wp.int32, device=self.device)
-        self._meshes: list[wp.Mesh | None] = []
-        self._first_face: list[int] = []
-        self._room: list[int] = []
-        self._bounds: list[np.ndarray] = []
-        self._faces = 0
-
-    def __len__(self) -> int:
-        return len(self._meshes)
-
-    def reserve(self, faces: int) -> int:
-        """Keeps room for a mesh of up to `faces` triangles that `replace` will bring, and returns its number."""
-        return self._append(None, faces, np.zeros((2, 3)))
-
-    def replace(self, number: int, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> None:
-        """Puts a mesh into a reserved place, instead of what was there.
-
-        Raises:
-            ValueError: Shapes do not fit, a corner does not exist, or there is no room for so many faces.
-        """
-        mesh, bounds = self._build(vertices, faces, labels)
-        if len(faces) > self._room[number]:
-            raise ValueError(f"faces must be at most {self._room[number]}, as reserved, not {len(faces)}")
-        self._meshes[number], self._bounds[number] = mesh, bounds
-        self._label(self._first_face[number], labels)
-
-    def add(self, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> int:
-        """Adds a mesh, builds its tree, and returns its number.
-
-        Args:
-            vertices: Shape (v, 3) [m].
-            faces: Corners of each triangle, shape (f, 3).
-            labels: Material + 256 × class of each face, shape (f,).
-
-        Raises:
-            ValueError: Shapes do not fit, a corner does not exist, or the set is full.
-        """
-        mesh, bounds = self._build(vertices, faces, labels)
-        number = self._append(mesh, len(faces), bounds)
-        self._label(self._first_face[number], labels)
-        return number
-
-    def _append(self, mesh: wp.Mesh | None, faces: int, bounds: np.ndarray) -> int:
-        if self._faces + faces > self.labels.shape[0]:
-            raise ValueError(f"max_faces must be at least {self._faces + faces}, not {self.labels.shape[0]}")
-        self._meshes.append(mesh)
-        self._first_face.append(self._faces)
-        self._room.append(faces)
-        self._bounds.append(bounds)
-        self._faces += faces
-        return len(self._meshes) - 1
-
-    def _label(self, first: int, labels: np.ndarray) -> None:
-        source = wp.array(np.ascontiguousarray(labels, np.int32), dtype=wp.int32, device=self.device)
-        wp.copy(self.labels, source, dest_offset=first, count=len(labels))
-
-    def _build(self, vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray) -> tuple[wp.Mesh, np.ndarray]:
-        """The mesh with its tree, and its lowest and highest corner."""
-        vertices = np.ascontiguousarray(vertices, np.float32)
-        faces = np.ascontiguousarray(faces, np.int32)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-            raise ValueError(f"vertices must be (v, 3), faces (f, 3), f > 0, not {vertices.shape} and {faces.shape}")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise ValueError(f"faces must name vertices 0 to {len(vertices) - 1}, not {faces.min()} to {faces.max()}")
-        if np.shape(labels) != (len(faces),):
-            raise ValueError(f"labels must have shape ({len(faces)},), not {np.shape(labels)}")
-        mesh = wp.Mesh(
-            points=wp.array(vertices, dtype=wp.vec3, device=self.device),
-            indices=wp.array(faces.ravel(), dtype=wp.int32, device=self.device),
-        )
-        return mesh, np.stack([vertices.min(0), vertices.max(0)])
-
-    def instances(self, mesh: np.ndarray, transforms: np.ndarray) -> dict[str, np.ndarray]:
-        """What the ray caster needs to know of instances, as host arrays.
-
-        Args:
-            mesh: Number of each instance's mesh, shape (k,).
-            transforms: World from local, affine (turned, scaled, moved), shape (k, 4, 4).
-        """
-        bounds = np.array([self._bounds[m] for m in mesh], np.float64).reshape(-1, 2, 3)
-        centre, half = bounds.mean(1), 0.5 * (bounds[:, 1] - bounds[:, 0])
-        world = np.einsum("kij,kj->ki", transforms[:, :3, :3], centre) + transforms[:, :3, 3]
-        reach = np.einsum("kij,kj->ki", np.abs(transforms[:, :3, :3]), half) + 1e-3
-        inverse = np.linalg.inv(transforms)[:, :3]
-        return {
-            "lower": (world - reach).astype(np.float32),
-            "upper": (world + reach).astype(np.float32),
-            "rows": inverse.astype(np.float32),
-            "mesh": np.array([self._meshes[m].id for m in mesh], np.uint64),
-            "first_face": np.array([self._first_face[m] for m in mesh], np.int32),
-        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -372,7 +289,7 @@ class LidarCast:
         hold("_fraction", upload(time / self.period, wp.float32, np.float32))
         hold("_pose", wp.zeros(2, dtype=wp.transform, device=device))
         hold("_seed", wp.zeros(1, dtype=wp.uint32, device=device))
-        hold("_material", wp.zeros((MATERIALS, 4), dtype=wp.float32, device=device))
+        hold("_material", wp.zeros((MATERIALS, 5), dtype=wp.float32, device=device))
         hold("_scene", [])
         hold("_scene_id", wp.zeros(1, dtype=wp.uint64, device=device))
         hold("_mesh", wp.zeros(self.max_instances, dtype=wp.uint64, device=device))
@@ -388,9 +305,13 @@ class LidarCast:
         hold("count", wp.zeros(1, dtype=wp.int32, device=device))
 
     def set_materials(self, table: np.ndarray) -> None:
-        """Sets reflectivity, porosity, loss and gloss of each material, all in [0, 1]; shape (256, 4)."""
-        if np.shape(table) != (MATERIALS, 4):
-            raise ValueError(f"table must have shape ({MATERIALS}, 4), not {np.shape(table)}")
+        """Sets the table of materials, shape (256, 5).
+
+        Reflectivity, share of beams that pass, share of echoes that are lost, share of the echo that is a mirror's,
+        all in [0, 1], and the depth over which the surface spreads its echoes, as leaves do [m].
+        """
+        if np.shape(table) != (MATERIALS, 5):
+            raise ValueError(f"table must have shape ({MATERIALS}, 5), not {np.shape(table)}")
         self._material.assign(np.ascontiguousarray(table, np.float32))
 
     def place(self, mesh: np.ndarray, transforms: np.ndarray) -> None:
@@ -432,10 +353,13 @@ class LidarCast:
             end: The same one period later; None for a sensor at rest.
             seed: Any integer.
         """
-        rows = []
+        rows: list[np.ndarray] = []
         for pose in (start, start if end is None else end):
             quaternion = wp.quat_from_matrix(wp.mat33(*np.asarray(pose, np.float64)[:3, :3].ravel()))
-            rows.append([*np.asarray(pose)[:3, 3], *quaternion])
+            row = np.array([*np.asarray(pose)[:3, 3], *quaternion])
+            if rows and np.dot(rows[0][3:], row[3:]) < 0:
+                row[3:] *= -1.0  # the same attitude, on the near side
+            rows.append(row)
         self._pose.assign(np.array(rows, np.float32))
         self._seed.assign(np.array([seed & 0xFFFFFFFF], np.uint32))
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
-from ...kernels.raycast import MeshSet
+from ...kernels.meshes import MeshSet
 from ..classes import BARRIER, CONE, CYCLIST, PEDESTRIAN, VEHICLE
 from . import people, structures, vegetation, vehicles
 from .mesh import Shape
@@ -39,7 +39,8 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "barrier": structures.barrier,
 }
 _VARIANTS = {
-    "tree": 16, "bush": 24, "hedge": 10, "thicket": 14, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8, "sign": 8, "bollard": 4,
+    "tree": 16, "bush": 24, "hedge": 10, "thicket": 14, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8,
+    "sign": 8, "bollard": 4,
     "bin": 6, "cabinet": 8, "hydrant": 2, "bike_rack": 8, "motorbike": 5, "bus_stop": 3, "table": 6, "stairs": 6,
     "cone": 4, "barrier": 8, "pedestrian": 24, "stander": 8, "cyclist": 12,
 }  # fmt: skip
@@ -66,7 +67,7 @@ def object_class(kind: str) -> int:
     return classes.get(kind, -1)
 
 
-@lru_cache(maxsize=None)
+@cache
 def prototype(kind: str, variant: int, phase: int = 0) -> Prototype:
     """The prototype of a kind; the same arguments give the same one, in every process.
 

@@ -95,12 +95,12 @@ def bicycle(point_class: PointClass = PointClass.OTHER) -> Shape:
     metal = face_label(Material.METAL, point_class)
     crank, saddle, head = np.array([-0.08, 0, 0.29]), np.array([-0.22, 0, 0.88]), np.array([0.38, 0, 0.82])
     rear, front = np.array([-0.54, 0, 0.34]), np.array([0.54, 0, 0.34])
-    bars = [(crank, saddle), (crank, head), (saddle * 0.9 + crank * 0.1, head), (rear, crank), (rear, saddle * 0.8 + crank * 0.2),
-            (front, head + [-0.03, 0, 0.13])]  # fmt: skip
+    bars = [(crank, saddle), (crank, head), (saddle * 0.9 + crank * 0.1, head), (rear, crank),
+            (rear, saddle * 0.8 + crank * 0.2), (front, head + np.array([-0.03, 0, 0.13]))]  # fmt: skip
     parts = [tube(np.array(pair), 0.018, metal, 5) for pair in bars]
     parts += [*_wheel(-0.54, 0.34, point_class), *_wheel(0.54, 0.34, point_class)]
     grip = head + np.array([-0.02, 0, 0.2])
-    parts.append(tube(np.array([grip + [-0.08, -0.29, 0], grip, grip + [-0.08, 0.29, 0]]), 0.015, metal, 5))
+    parts.append(tube(grip + np.array([[-0.08, -0.29, 0], [0, 0, 0], [-0.08, 0.29, 0]]), 0.015, metal, 5))
     parts.append(tube(np.array([head, grip]), 0.015, metal, 5))
     parts.append(box((-0.35, -0.07, 0.88), (-0.1, 0.07, 0.95), face_label(Material.DARK_CLOTH, point_class)))
     return join(*parts)
@@ -116,7 +116,7 @@ def cyclist(phase: int, random: np.random.Generator) -> Shape:
     hip = np.array([-0.2, 0.0, 0.95])
     shoulder = hip + 0.52 * size * np.array([np.sin(lean), 0, np.cos(lean)])
     parts = [bicycle(PointClass.CYCLIST)]
-    parts.append(_torso(hip, shoulder + [0, 0, 0.06], 0.19 * stout * size, 0.115 * stout * size, top))
+    parts.append(_torso(hip, shoulder + np.array([0, 0, 0.06]), 0.19 * stout * size, 0.115 * stout * size, top))
     for k, side in enumerate((-1.0, 1.0)):
         angle = 2 * np.pi * phase / PHASES + np.pi * k
         pedal = np.array([-0.08 + 0.17 * np.cos(angle), side * 0.11, 0.29 + 0.17 * np.sin(angle)])
@@ -127,7 +127,7 @@ def cyclist(phase: int, random: np.random.Generator) -> Shape:
         forward = np.array([-reach[2], 0, reach[0]]) / span
         at_knee = at_hip + 0.5 * reach + np.sqrt(max(bone**2 - 0.25 * span**2, 0.0)) * forward
         parts.append(_limb([at_hip, at_knee, pedal], [0.085 * stout, 0.058 * stout, 0.042], legs))
-        parts.append(_limb([pedal - [0.06, 0, 0], pedal + [0.15, 0, -0.02]], [0.04, 0.035], legs))
+        parts.append(_limb([pedal - np.array([0.06, 0, 0]), pedal + np.array([0.15, 0, -0.02])], [0.04, 0.035], legs))
         hand = np.array([0.3, side * 0.26, 1.03])
         at_shoulder = shoulder + np.array([0, side * 0.18 * size, -0.02])
         elbow = 0.5 * (at_shoulder + hand) + np.array([-0.05, side * 0.07, -0.06])

@@ -79,9 +79,14 @@ LIDARS: dict[str, Lidar] = {
         Lidar(
             name="hdl32", elevation=np.linspace(-30.67, 10.67, 32), azimuth_step=0.33, max_range=100.0, reach=45.0
         ),
-        Lidar(name="vlp32", elevation=_dense(32, -25.0, 15.0, -1.0, 3.0), azimuth_step=0.2, max_range=200.0, reach=80.0),
+        Lidar(
+            name="vlp32", elevation=_dense(32, -25.0, 15.0, -1.0, 3.0), azimuth_step=0.2, max_range=200.0, reach=80.0,
+        ),
         Lidar(name="xt32", elevation=np.linspace(-16.0, 15.0, 32), azimuth_step=0.18, max_range=120.0, reach=80.0),
-        Lidar(name="pandar40", elevation=_dense(40, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=200.0, reach=80.0),
+        Lidar(
+            name="pandar40",
+            elevation=_dense(40, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=200.0, reach=80.0,
+        ),
         Lidar(
             name="hdl64",
             # Two blocks of 32: steps of half a degree below −8°, of a third of a degree above.
@@ -92,9 +97,17 @@ LIDARS: dict[str, Lidar] = {
             drop_out=0.03,
             azimuth_offset=0.08,
         ),
-        Lidar(name="pandar64", elevation=_dense(64, -25.0, 15.0, -2.0, 3.5), azimuth_step=0.2, max_range=200.0, reach=80.0),
-        Lidar(name="pandar90", elevation=_dense(90, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=200.0, reach=80.0),
-        Lidar(name="vls128", elevation=_dense(128, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=245.0, reach=90.0),
+        Lidar(
+            name="pandar64",
+            elevation=_dense(64, -25.0, 15.0, -2.0, 3.5), azimuth_step=0.2, max_range=200.0, reach=80.0,
+        ),
+        Lidar(
+            name="pandar90",
+            elevation=_dense(90, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=200.0, reach=80.0,
+        ),
+        Lidar(
+            name="vls128", elevation=_dense(128, -25.0, 15.0, -2.0, 4.0), azimuth_step=0.2, max_range=245.0, reach=90.0,
+        ),
     )
 }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The simulator: a LiDAR driven along a procedural street, frame by frame with ground truth, and single random scenes."""
+"""The simulator: a LiDAR driven along a procedural street, with ground truth, and single random scenes."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import numpy as np
 
 from ...kernels.device import resolve_device
 from ...kernels.raycast import LidarCast
+from .furnishing import furnish, populate
 from .labels import GROUND_CLASSES, material_table
 from .library import Library, object_class, prototype
 from .sensors import LIDARS, Lidar, lidar_model
-from .street import STYLES, Street, furnish, phase_of, populate, random_street, travelled
+from .street import STYLES, Street, phase_of, random_street, travelled
 from .terrain import Ground
 
 __all__ = ["SCENARIOS", "SimulatedFrame", "Simulator", "sample_scene"]
@@ -48,7 +49,7 @@ class SimulatedFrame:
     ground: np.ndarray
     """True on road, sidewalk and terrain, shape (n,), bool."""
     boxes: np.ndarray
-    """Centre x y z, length width height [m], yaw [rad] of every object in range, tight to its shape; (k, 7), float32."""
+    """Centre x y z, length width height [m], yaw [rad] of every object in range, tight to it; (k, 7), float32."""
     classes: np.ndarray
     """Indices into `models.classes.CLASSES`, shape (k,), int32."""
     ids: np.ndarray
@@ -127,7 +128,13 @@ class _World:
 
 
 def place(
-    ground: Ground, s: np.ndarray, d: np.ndarray, yaw: np.ndarray, lift: np.ndarray, scale: np.ndarray, upright: np.ndarray
+    ground: Ground,
+    s: np.ndarray,
+    d: np.ndarray,
+    yaw: np.ndarray,
+    lift: np.ndarray,
+    scale: np.ndarray,
+    upright: np.ndarray,
 ) -> np.ndarray:
     """World from local of things on the ground, shape (k, 4, 4); those not upright follow its slope."""
     x, y, bend = ground.to_world(s, d)
@@ -306,8 +313,8 @@ class Simulator:
         ):  # fmt: skip
             add(kind, s, d, yaw, motion=(speed, 0.8, 0.5, random.uniform(0, 6.3)))
         for _ in range(6):
-            add("pedestrian", ahead + random.uniform(12, 40), random.choice([-1, 1]) * plan.half_width, np.pi / 2 * random.choice([-1, 1]),
-                motion=(random.uniform(0.9, 1.5), 0.05, 2.0, 0.0))  # fmt: skip
+            add("pedestrian", ahead + random.uniform(12, 40), random.choice([-1, 1]) * plan.half_width,
+                np.pi / 2 * random.choice([-1, 1]), motion=(random.uniform(0.9, 1.5), 0.05, 2.0, 0.0))  # fmt: skip
         populate(street, plan, walkers=60, riders=10, cars=0, works=2)
         furnish(street, plan, 0.75)
         populate(street, plan, walkers=30, riders=0, cars=0, works=0)

@@ -304,11 +304,11 @@ def bin_(random: np.random.Generator) -> Shape:
 
 def cabinet(random: np.random.Generator) -> Shape:
     """A switch cabinet, a parcel locker, an electricity box or a ticket machine."""
-    l, w, h = random.uniform(0.4, 1.8), random.uniform(0.3, 0.6), random.uniform(0.7, 1.9)
+    length, w, h = random.uniform(0.4, 1.8), random.uniform(0.3, 0.6), random.uniform(0.7, 1.9)
     label = face_label(Material.PLASTIC, _OTHER)
     return join(
-        box((-l / 2, -w / 2, 0), (l / 2, w / 2, h), label),
-        box((-l / 2 - 0.04, -w / 2 - 0.04, h), (l / 2 + 0.04, w / 2 + 0.04, h + 0.06), label),
+        box((-length / 2, -w / 2, 0), (length / 2, w / 2, h), label),
+        box((-length / 2 - 0.04, -w / 2 - 0.04, h), (length / 2 + 0.04, w / 2 + 0.04, h + 0.06), label),
     )
 
 
@@ -379,8 +379,12 @@ def table(random: np.random.Generator) -> Shape:
         parts.append(box((-0.4, -0.4, 0.7), (0.4, 0.4, 0.75), label))
         parts.append(tube(np.array([[0, 0, 0], [0, 0, 0.7]]), 0.05, label, 6))
         for yaw in random.uniform(0, 2 * np.pi, random.integers(2, 5)):
-            chair = join(box((0.55, -0.2, 0.4), (0.95, 0.2, 0.45), label), box((0.92, -0.2, 0.45), (0.96, 0.2, 0.9), label),
-                         *(box((x, y, 0), (x + 0.03, y + 0.03, 0.4), label) for x in (0.56, 0.92) for y in (-0.2, 0.17)))  # fmt: skip
+            feet = [box((x, y, 0), (x + 0.03, y + 0.03, 0.4), label) for x in (0.56, 0.92) for y in (-0.2, 0.17)]
+            seat, rest = (
+                box((0.55, -0.2, 0.4), (0.95, 0.2, 0.45), label),
+                box((0.92, -0.2, 0.45), (0.96, 0.2, 0.9), label),
+            )
+            chair = join(seat, rest, *feet)
             parts.append(chair.turned(yaw))
     else:
         parts += [box((-0.8, -0.2, 0.4), (0.8, 0.2, 0.46), label), box((-0.8, 0.2, 0.46), (0.8, 0.25, 0.9), label)]
@@ -394,8 +398,8 @@ def stairs(random: np.random.Generator) -> Shape:
     if random.random() < 0.5:
         w = random.uniform(0.8, 2.0)
         return join(*(box((-w, 0.3 * k, -0.2), (w, 1.5, 0.16 * (k + 1)), label) for k in range(random.integers(2, 5))))
-    l, w, h = random.uniform(0.5, 1.5), random.uniform(0.3, 0.7), random.uniform(0.4, 0.8)
-    return box((-l, -w, -0.1), (l, w, h), label)
+    half, w, h = random.uniform(0.5, 1.5), random.uniform(0.3, 0.7), random.uniform(0.4, 0.8)
+    return box((-half, -w, -0.1), (half, w, h), label)
 
 
 def cone(random: np.random.Generator) -> Shape:
@@ -412,7 +416,7 @@ def cone(random: np.random.Generator) -> Shape:
 
 
 def barrier(random: np.random.Generator) -> Shape:
-    """A road-work barrier: a concrete or plastic block of a Jersey profile, or boards on feet; its length lies along x."""
+    """A road-work barrier: a block of a Jersey profile, or boards on feet; its length lies along x."""
     if random.random() < 0.5:
         length, height = random.uniform(1.0, 3.0), random.uniform(0.75, 1.0)
         label = face_label(Material.CONCRETE if random.random() < 0.5 else Material.PLASTIC, PointClass.BARRIER)

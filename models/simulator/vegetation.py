@@ -102,11 +102,13 @@ def thicket(random: np.random.Generator) -> Shape:
     length, depth, height = random.uniform(5, 9), random.uniform(1.5, 4.0), random.uniform(2.0, 6.0)
     parts = []
     for _ in range(random.integers(4, 8)):
-        radii = np.array([random.uniform(0.8, 1.9), random.uniform(0.35, 0.5) * depth, height * random.uniform(0.3, 0.6)])
+        radii = np.array(
+            [random.uniform(0.8, 1.9), random.uniform(0.35, 0.5) * depth, height * random.uniform(0.3, 0.6)]
+        )
         centre = np.array([random.uniform(-0.45, 0.45) * length, random.normal(0, 0.15 * depth), 0.9 * radii[2]])
         points = centre + _cloud(int(190 * random.uniform(0.7, 1.2)), radii, random, 0.75)
         points[:, 2] = np.abs(points[:, 2])
         parts.append(leaves(points, random.uniform(0.22, 0.36), _LEAVES, random))
-        stem = np.array([centre * [1, 1, 0], centre + random.normal(0, 0.3, 3), centre + [0, 0, 0.8 * radii[2]]])
+        stem = np.array([centre * [1, 1, 0], centre + random.normal(0, 0.3, 3), centre + radii * [0, 0, 0.8]])
         parts.append(tube(stem, np.array([0.07, 0.05, 0.02]), _BARK, 5))
     return join(*parts)

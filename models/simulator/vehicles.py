@@ -100,7 +100,8 @@ _BODIES = {
         (4.8, 5.4), (1.88, 2.0), (1.92, 2.05),
         ((0, 0.38), (0.008, 0.66), (0.02, 0.90), (0.05, 0.98), (0.35, 1.0), (0.68, 0.99), (0.75, 0.93), (0.89, 0.57),
          (0.97, 0.48), (0.99, 0.40), (1, 0.30)),
-        (0.54, 0.51), (0.018, 0.04), (0.745, 0.885), (0.05, 0.33, 0.57, 0.78), 0.08, (0.2, 0.82), wheel=0.335, sill=0.25,
+        (0.54, 0.51), (0.018, 0.04), (0.745, 0.885), (0.05, 0.33, 0.57, 0.78), 0.08, (0.2, 0.82),
+        wheel=0.335, sill=0.25,
     ),
 }  # fmt: skip
 _PAINTS = (Material.DARK_PAINT, Material.PAINT, Material.PAINT, Material.BRIGHT_PAINT, Material.BRIGHT_PAINT)
@@ -116,7 +117,8 @@ def _wheels(axles: list[float], half_track: float, radius: float, width: float =
             # Tread, then the shoulder, then the dish of the rim.
             rings = []
             for y, r in ((inner, radius), (outer - side * 0.015, radius), (outer, 0.93 * radius),
-                         (outer, 0.66 * radius), (outer - side * 0.05, 0.6 * radius), (outer - side * 0.03, 0.05)):  # fmt: skip
+                         (outer, 0.66 * radius), (outer - side * 0.05, 0.6 * radius),
+                         (outer - side * 0.03, 0.05)):  # fmt: skip
                 rings.append(np.stack([x + r * np.cos(angle), np.full(14, y), radius + r * np.sin(angle)], 1))
             cells = np.array([Material.TYRE, Material.TYRE, Material.TYRE, Material.METAL, Material.METAL])
             labels = np.repeat((cells + 256 * PointClass.VEHICLE)[:, None], 14, 1)
@@ -258,10 +260,12 @@ def _truck(random: np.random.Generator) -> Shape:
     axles = [front - 0.75 * cab, back + 1.4] + ([back + 2.6] if length > 8 else [])
     parts.append(_wheels(axles, 0.48 * width, 0.46, 0.3))
     parts.append(quad(np.array([[back - 0.004, -0.26, 0.6], [back - 0.004, 0.26, 0.6],
-                                [back - 0.004, 0.26, 0.72], [back - 0.004, -0.26, 0.72]]), _label(Material.PLATE)))  # fmt: skip
+                                [back - 0.004, 0.26, 0.72], [back - 0.004, -0.26, 0.72]]),
+                      _label(Material.PLATE)))  # fmt: skip
     for side_y in (-1.0, 1.0):
+        at = side_y * (0.5 * width + 0.15)
         parts.append(
-            box((front - 0.25, side_y * (0.5 * width + 0.15) - 0.1, 1.6), (front - 0.15, side_y * (0.5 * width + 0.15) + 0.1, 2.1), dark).unboxed()
+            box((front - 0.25, at - 0.1, 1.6), (front - 0.15, at + 0.1, 2.1), dark).unboxed()
         )  # fmt: skip
     return join(*parts).centred()
 
@@ -269,7 +273,8 @@ def _truck(random: np.random.Generator) -> Shape:
 def _bus(random: np.random.Generator) -> Shape:
     length, width, height = random.uniform(9.0, 12.2), random.uniform(2.45, 2.55), random.uniform(2.85, 3.2)
     paint = _label(_PAINTS[1 + random.integers(len(_PAINTS) - 1)])
-    fractions = np.unique(np.concatenate([np.linspace(0.015, 0.985, 20), np.linspace(0.015, 0.985, 20)[1:-1] + 0.008, [0, 0.004, 0.995, 1]]))  # fmt: skip
+    panes = np.linspace(0.015, 0.985, 20)
+    fractions = np.unique(np.concatenate([panes, panes[1:-1] + 0.008, [0, 0.004, 0.995, 1]]))  # fmt: skip
     end = np.abs(2 * fractions - 1)
     x = (fractions - 0.5) * length
     half = 0.5 * width * (1 - 0.12 * np.clip((end - 0.97) / 0.03, 0, 1) ** 2)

@@ -78,7 +78,7 @@ def test_kinds_have_their_classes():
 
 def test_materials_are_shares():
     table = material_table()
-    assert table.shape == (256, 4)
+    assert table.shape == (256, 5)
     assert table.min() >= 0
     assert table.max() <= 1
     assert (table[: len(Material), 0] > 0).all()

@@ -49,7 +49,7 @@ def test_shapes_and_types_are_as_documented(drive):
     assert np.isfinite(frame.points).all()
     assert frame.points[:, 3].min() >= 0
     assert frame.points[:, 3].max() <= 1
-    assert 0 <= frame.t.min()
+    assert frame.t.min() >= 0
     assert frame.t.max() < 0.1
     assert len(drive) == 20
     assert frame.classes.max() < len(CLASSES)

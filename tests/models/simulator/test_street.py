@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from warploom.models.simulator.furnishing import furnish, populate
 from warploom.models.simulator.library import object_class, prototype
-from warploom.models.simulator.street import STYLES, furnish, phase_of, populate, random_street, travelled
+from warploom.models.simulator.street import STYLES, phase_of, random_street, travelled
 
 
 def build(seed, style, duration=0.0):
