@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .kernels.downsample import VoxelDownsample, voxel_downsample
     from .kernels.filters import Filtered, PointFilter, filter_points
     from .kernels.ground import Ground, GroundSegment, segment_ground
+    from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .models.head import DetectionHead
     from .models.tracker import Tracker, TrackerConfig, Tracks
@@ -43,6 +44,7 @@ _HOMES = {
     "kernels.downsample": ("VoxelDownsample", "voxel_downsample"),
     "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
+    "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "models.head": ("DetectionHead",),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
@@ -77,8 +79,11 @@ __all__ = [
     "cluster",
     "filter_points",
     "fit_boxes",
+    "giou_3d",
+    "iou_3d",
     "open_source",
     "read",
+    "rotated_iou_bev",
     "segment_ground",
     "voxel_downsample",
     "voxelize",

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from warploom.kernels.iou import iou_3d, rotated_iou_bev
+
+from warploom.kernels.iou import GeneralizedIou, giou_3d, iou_3d, rotated_iou_bev
+from warploom.models.geometry import box_overlap
 
 
 def some_boxes(rng, n, spread=8.0):
@@ -44,8 +47,6 @@ def reference(a, b):
 
 
 def on(device, array):
-    import warp as wp
-
     return array if device == "cpu" else wp.array(array, dtype=wp.float32, device=device)
 
 
@@ -144,3 +145,107 @@ def test_the_family_comes_back():
 def test_a_wrong_shape_is_refused():
     with pytest.raises(ValueError, match=r"a must have shape \(n, 7\)"):
         rotated_iou_bev(np.zeros((2, 6), np.float32), np.zeros((2, 7), np.float32))
+
+
+def enclosing_hulls(a, b):
+    """The areas from above of the convex hulls of all pairs."""
+    import shapely
+
+    pa, pb = polygons(a), polygons(b)
+    corners = np.concatenate(
+        [
+            np.broadcast_to(shapely.get_coordinates(pa).reshape(len(a), 1, 5, 2), (len(a), len(b), 5, 2)),
+            np.broadcast_to(shapely.get_coordinates(pb).reshape(1, len(b), 5, 2), (len(a), len(b), 5, 2)),
+        ],
+        axis=2,
+    )
+    return shapely.area(shapely.convex_hull(shapely.multipoints(corners)))
+
+
+def test_giou_agrees_with_shapelys_convex_hulls(device):
+    """Within 3e-5, the rounding of float32 coordinates of some metres."""
+    rng = np.random.default_rng(6)
+    a, b = some_boxes(rng, 90), some_boxes(rng, 80)
+    _, iou = reference(a, b)
+    a64, b64 = a.astype(np.float64), b.astype(np.float64)
+    volume = [boxes[:, 3] * boxes[:, 4] * boxes[:, 5] for boxes in (a64, b64)]
+    both = volume[0][:, None] + volume[1][None, :]
+    union = both / (1 + iou)
+    top = np.maximum((a64[:, 2] + a64[:, 5] / 2)[:, None], (b64[:, 2] + b64[:, 5] / 2)[None, :])
+    low = np.minimum((a64[:, 2] - a64[:, 5] / 2)[:, None], (b64[:, 2] - b64[:, 5] / 2)[None, :])
+    body = enclosing_hulls(a, b) * (top - low)
+    got = giou_3d(on(device, a), on(device, b))
+    got = got if isinstance(got, np.ndarray) else got.numpy()
+    np.testing.assert_allclose(got, iou - (body - union) / body, atol=3e-5)
+
+
+def test_giou_with_the_box_along_the_first_agrees_with_numpys(device):
+    """Within 3e-5, as above."""
+    rng = np.random.default_rng(7)
+    a, b = some_boxes(rng, 70), some_boxes(rng, 60)
+    expected = box_overlap(np.repeat(a, len(b), axis=0), np.tile(b, (len(a), 1)))[2].reshape(len(a), len(b))
+    got = giou_3d(on(device, a), on(device, b), enclosing="box")
+    got = got if isinstance(got, np.ndarray) else got.numpy()
+    np.testing.assert_allclose(got, expected, atol=3e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(-1e5, 1e5, width=32),
+    st.floats(0.25, 15, width=32),
+    st.floats(0.25, 4, width=32),
+    st.floats(-7, 7, width=32),
+    st.sampled_from([0.0, np.pi, -np.pi, 2 * np.pi, 1e-7, -1e-6]),
+    st.sampled_from(["hull", "box"]),
+)
+def test_giou_of_a_box_with_its_like_is_one(x, length, width, yaw, turn, enclosing):
+    """Corners that coincide, or nearly, wherever the box is: the case that walks around hulls get wrong."""
+    box = np.array([[x, -x / 2, 0, length, width, 1.5, yaw]], np.float32)
+    like = box.copy()
+    like[0, 6] += turn
+    assert giou_3d(box, like, enclosing=enclosing)[0, 0] == pytest.approx(1.0, abs=4e-4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_giou_is_bounded_and_falls_with_distance(seed):
+    rng = np.random.default_rng(seed)
+    a = some_boxes(rng, 1, 3.0)
+    b = np.repeat(some_boxes(rng, 1, 3.0), 30, axis=0)
+    b[:, 0] = a[0, 0] + np.linspace(20, 400, 30)
+    apart = giou_3d(a, b)[0]
+    assert (np.diff(apart) < 1e-6).all()
+    assert apart.min() >= -1
+    close = some_boxes(rng, 40, 3.0)
+    near = giou_3d(a, close)
+    assert near.min() >= -1
+    assert (near <= iou_3d(a, close) + 1e-6).all()
+
+
+def test_giou_hand_cases():
+    unit = np.array([[0, 0, 0, 2, 2, 2, 0]], np.float32)
+    others = np.float32([[2, 0, 0, 2, 2, 2, 0], [0, 0, 2, 2, 2, 2, np.pi / 2], [4, 0, 0, 2, 2, 2, 0]])
+    for enclosing in ("hull", "box"):
+        np.testing.assert_allclose(giou_3d(unit, others, enclosing=enclosing)[0], [0, 0, -1 / 3], atol=1e-6)
+    corner = np.float32([[2, 2, 0, 2, 2, 2, 0]])
+    assert giou_3d(unit, corner)[0, 0] == pytest.approx(-4 / 12, abs=1e-6)
+    assert giou_3d(unit, corner, enclosing="box")[0, 0] == pytest.approx(-8 / 16, abs=1e-6)
+
+
+def test_giou_of_what_is_not_finite_or_empty_is_minus_one():
+    good = np.array([[0, 0, 0, 4, 2, 2, 0]], np.float32)
+    bad = np.repeat(good, 4, axis=0)
+    bad[0, 0], bad[1, 6], bad[2, 3], bad[3, 5] = np.inf, np.nan, 0.0, -1.0
+    assert (giou_3d(good, bad) == -1).all()
+    assert (giou_3d(bad, good) == -1).all()
+    assert giou_3d(np.empty((0, 7), np.float32), good).shape == (0, 1)
+
+
+def test_giou_refuses_what_it_does_not_know():
+    box = np.zeros((1, 7), np.float32)
+    with pytest.raises(ValueError, match="enclosing must be one of hull, box, not 'sphere'"):
+        giou_3d(box, box, enclosing="sphere")
+    with pytest.raises(ValueError, match="enclosing must be one of"):
+        GeneralizedIou(rows=1, columns=1, enclosing="sphere")
+    with pytest.raises(ValueError, match="more than the plan's 1 × 1"):
+        GeneralizedIou(rows=1, columns=1).launch(wp.zeros((2, 7)), wp.zeros((2, 7)), wp.zeros(2, dtype=int))
