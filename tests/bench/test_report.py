@@ -82,7 +82,7 @@ def test_machine_versions_figures_stages_and_what_was_skipped_are_named():
             "stats": {},
             "extra_info": {"on": "street", "stages": {"perception.ground": {"run_ms": 3.21, "wait_ms": 0.0}}},
         },
-        {"stats": {}, "extra_info": {"first_calls": {"cluster": {"cold_s": 2.5, "warm_s": 0.02}}}},
+        {"stats": {}, "extra_info": {"first_calls": {"cluster": {"cold_s": 2.5, "warm_s": 0.02, "second_s": 0.003}}}},
     )
     assert "Example 9000, 2 cores, 8.0 GiB" in text
     assert "2030-01-02" in text
@@ -91,7 +91,7 @@ def test_machine_versions_figures_stages_and_what_was_skipped_are_named():
     assert row(text, "peak resident") == ["peak resident memory", "900 MiB", "≤ 2048 MiB", "yes", "1000 frames"]
     assert row(text, "first frame")[1:4] == ["4.25 s", "≤ 4 s", "**no**"]
     assert row(text, "perception.ground")[1] == "3.21"
-    assert row(text, "cluster") == ["cluster", "2.50", "0.0200"]
+    assert row(text, "cluster") == ["cluster", "2.50", "0.0200", "3.00"]
     assert "no CUDA device here: `bench_bev[warploom cuda:0-KITTI]`" in text
 
 
