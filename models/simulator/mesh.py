@@ -58,8 +58,9 @@ class Shape:
 def _shape(vertices: np.ndarray, faces: np.ndarray, labels: np.ndarray | int) -> Shape:
     faces = np.asarray(faces, np.int32).reshape(-1, 3)
     vertices = np.asarray(vertices, np.float64)
-    labels = np.broadcast_to(np.asarray(labels, np.int32), len(faces)).copy()
-    return Shape(vertices, faces, labels, np.ones(len(vertices), bool))
+    if not isinstance(labels, np.ndarray):
+        labels = np.full(len(faces), labels, np.int32)
+    return Shape(vertices, faces, labels.astype(np.int32), np.ones(len(vertices), bool))
 
 
 def join(*shapes: Shape) -> Shape:
@@ -93,12 +94,15 @@ def loft(sections: np.ndarray, labels: np.ndarray | int, *, closed: bool = False
     shape = _shape(sections.reshape(-1, 3), faces, np.repeat(cells.ravel(), 2))
     if caps is None:
         return shape
-    ends = []
-    for row in (sections[0], sections[-1]):
-        rim = np.arange(m)
-        fan = np.stack([np.full(m, m), rim, (rim + 1) % m], 1)
-        ends.append(_shape(np.concatenate([row, row.mean(0, keepdims=True)]), fan, caps))
-    return join(shape, *ends)
+    rim = np.arange(m)
+    fan = np.stack([np.full(m, n * m), rim, (rim + 1) % m], 1)
+    far = np.stack([np.full(m, n * m + 1), (n - 1) * m + rim, (n - 1) * m + (rim + 1) % m], 1)
+    middles = sections[[0, -1]].sum(1) / m
+    return _shape(
+        np.concatenate([shape.vertices, middles]),
+        np.concatenate([shape.faces, fan, far]),
+        np.concatenate([shape.labels, np.full(2 * m, caps)]),
+    )
 
 
 def quad(corners: np.ndarray, label: int) -> Shape:
@@ -119,16 +123,22 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], label
     return _shape(vertices, _BOX_FACES, label)
 
 
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])  # the indices of a cross product
+
+
 def tube(path: np.ndarray, radius: np.ndarray | float, label: int, sides: int = 6, *, caps: bool = True) -> Shape:
     """A round bar along a path of n points, shape (n, 3), of one radius or one at each point [m]."""
     path = np.asarray(path, np.float64)
-    along = np.gradient(path, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True) + 1e-12
+    along = np.empty_like(path)
+    along[1:-1] = path[2:] - path[:-2]
+    along[0], along[-1] = path[1] - path[0], path[-1] - path[-2]
+    along /= np.sqrt((along * along).sum(1, keepdims=True)) + 1e-12
     # Any direction across the path does; the axis least along it is never parallel to it.
-    helper = np.eye(3)[np.argmin(np.abs(along).max(0))]
-    u = np.cross(along, helper)
-    u /= np.linalg.norm(u, axis=1, keepdims=True) + 1e-12
-    v = np.cross(along, u)
+    axis = int(np.abs(along).max(0).argmin())
+    u = np.zeros_like(along)
+    u[:, (axis + 1) % 3], u[:, (axis + 2) % 3] = along[:, (axis + 2) % 3], -along[:, (axis + 1) % 3]
+    u /= np.sqrt((u * u).sum(1, keepdims=True)) + 1e-12
+    v = along[:, _NEXT] * u[:, _LAST] - along[:, _LAST] * u[:, _NEXT]
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.cos(angle)[None, :, None] * u[:, None] + np.sin(angle)[None, :, None] * v[:, None]
     radii = np.broadcast_to(np.asarray(radius, np.float64), len(path))[:, None, None]
