@@ -32,7 +32,7 @@ train: $(VENV)/.dev
 	$(BIN)/python -m warploom.models.training --seed 0 --out training-run
 
 wheel: $(VENV)/.dev
-	$(BIN)/python -m build --wheel --outdir dist .
+	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
