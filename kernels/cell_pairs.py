@@ -2,6 +2,10 @@
 
 A cell's side is radius / √3, so that any two of its points are within the radius; all that is left to find out is
 which cells, at most two apart along each axis, have a pair of points within it.
+
+A radius that grows with the range is cut into levels, eight to an octave, each with cells of its own as large as its
+least radius allows. Within a level two cells that touch are still at most two apart, as radii in it differ by no more
+than an eighth; `join_levels` sees to the pairs of cells of different levels. A cell's level is carried in its x.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ __all__ = [
     "hash_cell",
     "hash_column",
     "is_finite",
+    "join_levels",
     "radius_of",
     "touch",
     "unite",
@@ -28,6 +33,11 @@ __all__ = [
 _LARGEST_CELL = wp.constant(wp.float64(2.0**30))
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))
 _BRUTE_FORCE = wp.constant(wp.int64(4096))  # pairs of points up to which nothing beats trying them all
+_SUB_LEVEL = wp.constant(wp.int64(49))  # bits of a float64 below its exponent and three bits of fraction: the level
+_LEVEL_OF_ONE = wp.constant(wp.int64(1023 << 3))
+_LEVEL_BITS = wp.constant(19)  # bits of x below its level
+_HALF_LEVEL = wp.constant(1 << 18)
+_LARGEST_SQUARE = wp.constant(wp.float64(3.0e38))
 
 
 @wp.struct
@@ -38,11 +48,14 @@ class Radius:
     surely: wp.float32  # squared distances in float32 up to here are within the radius whatever the rounding
     surely_not: wp.float32  # and above here they are not
     squared: wp.float64
+    at_origin: wp.float64
+    per_metre: wp.float64  # of range; 0 for one radius everywhere, whose cells have no levels
 
 
-def radius_of(radius: float) -> Radius:
-    """The numbers that kernels need of a radius [m]."""
+def radius_of(radius: float, per_metre: float = 0.0) -> Radius:
+    """The numbers that kernels need of a radius [m] that grows with the range, by `per_metre` of 0 or 1e-5 … 1."""
     numbers = Radius()
+    numbers.at_origin, numbers.per_metre = radius, per_metre
     # A hair shorter, so that no rounding makes the diagonal longer than the radius.
     numbers.inverse_side = math.sqrt(3.0) / (radius * (1.0 - 1e-6))
     numbers.squared = radius * radius
@@ -65,8 +78,37 @@ def _cell_along(coordinate: float, inverse_side: wp.float64) -> int:
 
 
 @wp.func
+def _reach_at(point: wp.vec3, radius: Radius) -> wp.float64:
+    """The radius at a point."""
+    x = wp.float64(point[0])
+    y = wp.float64(point[1])
+    z = wp.float64(point[2])
+    return radius.at_origin + radius.per_metre * wp.sqrt(x * x + y * y + z * z)
+
+
+@wp.func
+def _level_of(growth: wp.float64) -> int:
+    """The level of a radius, given as a multiple, ≥ 1, of that at the origin."""
+    return int((wp.cast(growth, wp.int64) >> _SUB_LEVEL) - _LEVEL_OF_ONE)
+
+
+@wp.func
+def _growth_of(level: int) -> wp.float64:
+    """The least multiple of the radius at the origin that is of a level."""
+    return wp.cast((wp.int64(level) + _LEVEL_OF_ONE) << _SUB_LEVEL, wp.float64)
+
+
+@wp.func
 def cell_of(point: wp.vec3, radius: Radius) -> wp.vec3i:
     """The cell of a finite point."""
+    if radius.per_metre > wp.float64(0.0):
+        level = _level_of(_reach_at(point, radius) / radius.at_origin)
+        inverse_side = radius.inverse_side / _growth_of(level)
+        return wp.vec3i(
+            int(wp.floor(wp.float64(point[0]) * inverse_side)) + (level << _LEVEL_BITS),
+            int(wp.floor(wp.float64(point[1]) * inverse_side)),
+            int(wp.floor(wp.float64(point[2]) * inverse_side)),
+        )
     return wp.vec3i(
         _cell_along(point[0], radius.inverse_side),
         _cell_along(point[1], radius.inverse_side),
@@ -117,7 +159,11 @@ def _is_near(p: wp.vec3, q: wp.vec3, radius: Radius) -> bool:
         dx = wp.float64(p[0]) - wp.float64(q[0])
         dy = wp.float64(p[1]) - wp.float64(q[1])
         dz = wp.float64(p[2]) - wp.float64(q[2])
-        near = dx * dx + dy * dy + dz * dz <= radius.squared
+        limit = radius.squared
+        if radius.per_metre > wp.float64(0.0):
+            reach = wp.min(_reach_at(p, radius), _reach_at(q, radius))
+            limit = reach * reach
+        near = dx * dx + dy * dy + dz * dz <= limit
     return near
 
 
@@ -181,8 +227,7 @@ def _touch_large(
 
 
 @wp.func
-def touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
-    """Whether any point of one cell is within the radius of any point of another."""
+def _touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
     if wp.int64(a_end - a_begin) * wp.int64(b_end - b_begin) > _BRUTE_FORCE:
         return _touch_large(points, a_begin, a_end, b_begin, b_end, radius)
     for i in range(a_begin, a_end):
@@ -191,6 +236,23 @@ def touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: in
             if _is_near(p, points[j], radius):
                 return True
     return False
+
+
+@wp.func
+def touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
+    """Whether any point of one cell is within the radius of any point of another; of two radii the smaller holds."""
+    if radius.per_metre > wp.float64(0.0):
+        reach = wp.min(_reach_at(points[a_begin], radius), _reach_at(points[b_begin], radius))
+        level = _level_of(reach / radius.at_origin)
+        least = radius.at_origin * _growth_of(level)
+        most = radius.at_origin * _growth_of(level + 1)
+        here = Radius()
+        here.surely = float(wp.min(least * least * wp.float64(1.0 - 1e-6), _LARGEST_SQUARE))
+        here.surely_not = float(most * most * wp.float64(1.0 + 1e-6))
+        here.at_origin = radius.at_origin
+        here.per_metre = radius.per_metre
+        return _touch(points, a_begin, a_end, b_begin, b_end, here)
+    return _touch(points, a_begin, a_end, b_begin, b_end, radius)
 
 
 @wp.func
@@ -223,3 +285,52 @@ def unite(parent: wp.array(dtype=wp.int32), a: int, b: int):
             # Another thread was first: go on from where it hung the root.
             high = find(parent, found)
             low = find(parent, low)
+
+
+@wp.func
+def join_levels(
+    a: int,
+    table: wp.array(dtype=wp.int32),
+    cell_of_slot: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.vec3i),
+    cell_begin: wp.array(dtype=wp.int32),
+    cell_end: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites a cell with those of higher levels that it touches; `cell_of_slot` is null where `table` has the cells."""
+    cell = cells[a]
+    level = (cell[0] + _HALF_LEVEL) >> _LEVEL_BITS
+    side = _growth_of(level) / radius.inverse_side
+    low = wp.vec3d(
+        wp.float64(cell[0] - (level << _LEVEL_BITS)) * side, wp.float64(cell[1]) * side, wp.float64(cell[2]) * side
+    )
+    high = low + wp.vec3d(side, side, side)
+    # The longest radius in the cell, and the longest at a point within it.
+    farthest = radius.at_origin + radius.per_metre * wp.length(wp.max(-low, high))
+    reach = wp.min(farthest, radius.at_origin * _growth_of(level + 1)) * wp.float64(1.0 + 1e-6)
+    last = _level_of((farthest + radius.per_metre * reach) / radius.at_origin * wp.float64(1.0 + 1e-6))
+    mask = table.shape[0] - 1
+    for other in range(level + 1, last + 1):
+        inverse_side = radius.inverse_side / _growth_of(other)
+        for x in range(int(wp.floor((low[0] - reach) * inverse_side)), int((high[0] + reach) * inverse_side) + 1):
+            for y in range(int(wp.floor((low[1] - reach) * inverse_side)), int((high[1] + reach) * inverse_side) + 1):
+                first_z = int(wp.floor((low[2] - reach) * inverse_side))
+                for z in range(first_z, int((high[2] + reach) * inverse_side) + 1):
+                    wanted = wp.vec3i(x + (other << _LEVEL_BITS), y, z)
+                    slot = hash_cell(wanted) & mask
+                    b = table[slot]
+                    if b >= 0 and cell_of_slot:
+                        b = cell_of_slot[slot]
+                    while b >= 0 and differ(cells[b], wanted):
+                        slot = (slot + 1) & mask
+                        b = table[slot]
+                        if b >= 0 and cell_of_slot:
+                            b = cell_of_slot[slot]
+                    if (
+                        b >= 0
+                        and find(parent, a) != find(parent, b)
+                        and touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius)
+                    ):
+                        unite(parent, a, b)

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .cell_pairs import Radius, cell_of, differ, find, hash_cell, is_finite, radius_of, touch, unite
-from .cluster_columns import gather_cells_in_order, join_in_order, label_in_order
+from .cell_pairs import Radius, differ, find, hash_cell, join_levels, radius_of, touch, unite
+from .cell_table import CellTable, free_slot
+from .cluster_columns import gather_cells_in_order, join_in_order, join_levels_in_order, label_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -25,114 +26,8 @@ __all__ = ["EuclideanCluster", "cluster"]
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_NO_POINT = wp.constant(wp.int32(2**31 - 1))
 _SMALLEST_RADIUS = 1e-8
-
-
-@wp.kernel
-def _claim_cells(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    include_in: wp.array(dtype=wp.uint8),
-    has_include: int,
-    radius: Radius,
-    # in out: a table of points that stand for their cells, -1 where free; lowest points and sizes
-    table: wp.array(dtype=wp.int32),
-    lowest: wp.array(dtype=wp.int32),
-    size: wp.array(dtype=wp.int32),
-    # out
-    slot_of_point: wp.array(dtype=wp.int32),
-    cell_size: wp.array(dtype=wp.int32),
-):
-    """Finds each point's slot in the table, which whichever point comes first claims for the cell."""
-    i = wp.tid()
-    slot_of_point[i] = -1
-    cell_size[i] = 0
-    if i >= count_in[0]:
-        return
-    point = xyz_in[i]
-    if not is_finite(point):
-        return
-    if has_include != 0 and include_in[i] == wp.uint8(0):
-        return
-    cell = cell_of(point, radius)
-    mask = table.shape[0] - 1
-    slot = hash_cell(cell) & mask
-    found = wp.atomic_cas(table, slot, -1, i)
-    while found >= 0 and differ(cell_of(xyz_in[wp.max(found, 0)], radius), cell):
-        slot = (slot + 1) & mask
-        found = wp.atomic_cas(table, slot, -1, i)
-    slot_of_point[i] = slot
-    wp.atomic_min(lowest, slot, i)
-    wp.atomic_add(size, slot, 1)
-
-
-@wp.kernel
-def _mark_lowest(
-    # in
-    slot_of_point: wp.array(dtype=wp.int32),
-    lowest: wp.array(dtype=wp.int32),
-    # out
-    head_out: wp.array(dtype=wp.int32),
-):
-    """Marks the lowest point of each cell."""
-    i = wp.tid()
-    head = int(0)
-    slot = slot_of_point[i]
-    if slot >= 0 and lowest[slot] == i:
-        head = 1
-    head_out[i] = head
-
-
-@wp.kernel
-def _number_cells(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    slot_of_point: wp.array(dtype=wp.int32),
-    head_in: wp.array(dtype=wp.int32),
-    rank_in: wp.array(dtype=wp.int32),
-    size: wp.array(dtype=wp.int32),
-    radius: Radius,
-    # out
-    cell_of_slot: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=wp.vec3i),
-    cell_size: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    cell_count: wp.array(dtype=wp.int32),
-):
-    """Numbers the cells by their lowest point."""
-    i = wp.tid()
-    if i == head_in.shape[0] - 1:
-        cell_count[0] = rank_in[i]
-    if head_in[i] == 0:
-        return
-    slot = slot_of_point[i]
-    c = rank_in[i] - 1
-    cell_of_slot[slot] = c
-    cells[c] = cell_of(xyz_in[i], radius)
-    cell_size[c] = size[slot]
-    parent[c] = c
-    members[c] = 0
-
-
-@wp.kernel
-def _scatter_points(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    slot_of_point: wp.array(dtype=wp.int32),
-    cell_of_slot: wp.array(dtype=wp.int32),
-    # in out: where each cell ends, from last to first
-    cell_end: wp.array(dtype=wp.int32),
-    # out
-    points: wp.array(dtype=wp.vec3),
-):
-    """Lists the points of each cell, in any order: whether two cells touch does not hang on it."""
-    i = wp.tid()
-    slot = slot_of_point[i]
-    if slot >= 0:
-        points[wp.atomic_sub(cell_end, cell_of_slot[slot], 1) - 1] = xyz_in[i]
+_LEAST_GROWTH = 1e-5
 
 
 @wp.kernel
@@ -140,7 +35,6 @@ def _join_cells(
     # in
     table: wp.array(dtype=wp.int32),
     cell_of_slot: wp.array(dtype=wp.int32),
-    lowest: wp.array(dtype=wp.int32),
     cells: wp.array(dtype=wp.vec3i),
     cell_begin: wp.array(dtype=wp.int32),
     cell_size: wp.array(dtype=wp.int32),
@@ -169,6 +63,26 @@ def _join_cells(
                 if touch(points, a_begin, a_begin + cell_size[a], b_begin, b_begin + cell_size[b], radius):
                     unite(parent, a, b)
             return
+
+
+@wp.kernel
+def _join_levels(
+    # in
+    table: wp.array(dtype=wp.int32),
+    cell_of_slot: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.vec3i),
+    cell_begin: wp.array(dtype=wp.int32),
+    cell_end: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    cell_count: wp.array(dtype=wp.int32),
+    radius: Radius,
+    # in out
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites cells of different levels that touch."""
+    a = wp.tid()
+    if a < cell_count[0]:
+        join_levels(a, table, cell_of_slot, cells, cell_begin, cell_end, points, radius, parent)
 
 
 @wp.kernel
@@ -229,9 +143,7 @@ def _label_points(
         root = find(parent, cell_of_slot[slot])
         if head_in[root] == 1:
             label = rank_in[root] - 1
-        table[slot] = -1
-        lowest[slot] = _NO_POINT
-        size[slot] = 0
+        free_slot(slot, table, lowest, size)
     labels_out[i] = label
 
 
@@ -241,6 +153,8 @@ class EuclideanCluster:
 
     radius: float
     """Longest step [m] that joins two points."""
+    radius_per_metre: float = 0.0
+    """By how much it grows per metre of range, 0 or 1e-5 … 1: two points then go by the one nearer to the origin."""
     min_size: int = 1
     """Points that make a cluster; smaller ones get the label -1."""
     capacity: int
@@ -261,6 +175,11 @@ class EuclideanCluster:
             raise ValueError(
                 f"radius must be a positive number of metres (at least {_SMALLEST_RADIUS}), not {self.radius}"
             )
+        if self.radius_per_metre != 0 and not _LEAST_GROWTH <= self.radius_per_metre <= 1:
+            raise ValueError(
+                f"radius_per_metre must be 0, or from {_LEAST_GROWTH} to 1 metre per metre of range, "
+                f"not {self.radius_per_metre}"
+            )
         for name in ("min_size", "capacity"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -268,7 +187,6 @@ class EuclideanCluster:
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
-        slots = 2 << (self.capacity - 1).bit_length()
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
@@ -277,34 +195,31 @@ class EuclideanCluster:
             for name in names:
                 keep(name, wp.empty(self.capacity, dtype=dtype, device=device))
 
-        keep("_radius", radius_of(self.radius))
+        keep("_radius", radius_of(self.radius, self.radius_per_metre))
         keep("_sequential", sequential)
         keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
-        keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
-        buffers(wp.vec3, "_points")
-        buffers(wp.vec3i, "_cells")
-        buffers(wp.int32, "labels", "_cell_begin", "_cell_end", "_parent", "_members")
+        buffers(wp.int32, "labels", "_cell_end")
         keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
         forward = [d for d in np.ndindex(5, 5, 5) if d > (2, 2, 2)]
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         if sequential:
             flat = np.unique(offsets[:, :2], axis=0)
             flat = flat[np.argsort((flat**2).sum(1), kind="stable")][1:]
+            slots = 2 << (self.capacity - 1).bit_length()
             keep("_near_offsets", int((np.abs(flat).max(1) == 1).sum()))
             keep("_offsets", wp.array(flat, dtype=wp.vec2i, device=device))
-            keep("_column_table", wp.full(slots, -1, dtype=wp.int32, device=device))
+            for name in ("_table", "_column_table"):
+                keep(name, wp.full(slots, -1, dtype=wp.int32, device=device))
+            buffers(wp.vec3, "_points")
+            buffers(wp.vec3i, "_cells")
             buffers(wp.vec4i, "_columns")
             buffers(wp.vec2i, "_stack")
-            buffers(wp.int32, "_cell_of_point", "_cell_slot", "_cell_column")
+            buffers(wp.int32, "_cell_begin", "_parent", "_members", "_cell_of_point", "_cell_slot", "_cell_column")
             buffers(wp.int32, "_column_slot", "_column_root")
             keep("_sizes", wp.zeros(2, dtype=wp.int32, device=device))
         else:
             keep("_offsets", wp.array(offsets, dtype=wp.vec3i, device=device))
-            keep("_lowest", wp.full(slots, 2**31 - 1, dtype=wp.int32, device=device))
-            keep("_size", wp.zeros(slots, dtype=wp.int32, device=device))
-            keep("_cell_of_slot", wp.empty(slots, dtype=wp.int32, device=device))
-            keep("_cell_count", wp.zeros(1, dtype=wp.int32, device=device))
-            buffers(wp.int32, "_slot_of_point", "_head", "_rank", "_cell_size")
+            keep("_by_cell", CellTable(self._radius, self.capacity, device))
 
     def launch(self, xyz: wp.array, count: wp.array, include: wp.array | None = None) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -323,13 +238,13 @@ class EuclideanCluster:
             if include.shape[0] < n or include.dtype not in (wp.bool, wp.uint8):
                 raise ValueError(f"include must be bool or uint8 with at least {n} rows, as there are points")
             mask, has_include = include.view(wp.uint8) if include.dtype == wp.bool else include, 1
-        given = [xyz, count, mask, has_include, self._radius]
         if self._sequential:
-            self._launch_in_order(n, given)
+            self._launch_in_order(n, [xyz, count, mask, has_include, self._radius])
         elif n == 0:
             self.cluster_count.zero_()
         else:
-            self._launch_shared(n, given)
+            self._by_cell.launch(xyz, count, mask, has_include)
+            self._launch_shared(n)
 
     def _launch_in_order(self, n: int, given: list) -> None:
         tables = [self._table, self._column_table]
@@ -354,6 +269,12 @@ class EuclideanCluster:
             ],
             [self._parent, self._column_root],
         )
+        if self.radius_per_metre > 0:
+            run(
+                join_levels_in_order,
+                [self._table, None, self._cells, *cell_ends, self._points, self._sizes, self._radius],
+                [self._parent],
+            )
         run(
             label_in_order,
             [
@@ -363,60 +284,50 @@ class EuclideanCluster:
             [*tables, self._members, self.labels[:n], self.cluster_count],
         )
 
-    def _launch_shared(self, n: int, given: list) -> None:
-        xyz, radius = given[0], self._radius
-        slot_of_point, head, rank = self._slot_of_point[:n], self._head[:n], self._rank[:n]
-        cell_size, cell_begin, cell_end = self._cell_size[:n], self._cell_begin[:n], self._cell_end[:n]
-        slots = [self._table, self._lowest, self._size]
+    def _launch_shared(self, n: int) -> None:
+        by_cell, radius = self._by_cell, self._radius
+        parent, members, cell_count = by_cell.parent, by_cell.members, by_cell.cell_count
+        cell_size, cell_begin = by_cell.cell_size[:n], by_cell.cell_begin
+        head, rank = by_cell.head[:n], by_cell.rank[:n]
+        found = [by_cell.table, by_cell.cell_of_slot]
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list, dim: int | tuple[int, int] = n) -> None:
             wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
 
-        # Cells, numbered by their lowest point.
-        run(_claim_cells, given, [*slots, slot_of_point, cell_size])
-        run(_mark_lowest, [slot_of_point, self._lowest], [head])
-        wp.utils.array_scan(head, rank, inclusive=True)
-        run(
-            _number_cells,
-            [xyz, slot_of_point, head, rank, self._size, radius],
-            [self._cell_of_slot, self._cells, cell_size, self._parent, self._members, self._cell_count],
-        )
-        # Points by cell.
-        wp.utils.array_scan(cell_size, cell_begin, inclusive=False)
-        wp.utils.array_scan(cell_size, cell_end, inclusive=True)
-        run(_scatter_points, [xyz, slot_of_point, self._cell_of_slot], [cell_end, self._points])
         # Components of cells.
-        run(
-            _join_cells,
-            [
-                *(self._table, self._cell_of_slot, self._lowest, self._cells, cell_begin, cell_size, self._points),
-                *(self._cell_count, self._offsets, radius),
-            ],
-            [self._parent],
-            (self._offsets.shape[0], n),
-        )
-        run(_count_members, [cell_size, self._cell_count], [self._parent, self._members])
+        inputs = [*found, by_cell.cells, cell_begin, cell_size, by_cell.points, cell_count, self._offsets, radius]
+        run(_join_cells, inputs, [parent], (self._offsets.shape[0], n))
+        if self.radius_per_metre > 0:
+            wp.utils.array_scan(cell_size, self._cell_end[:n], inclusive=True)
+            inputs = [*found, by_cell.cells, cell_begin, self._cell_end, by_cell.points, cell_count, radius]
+            run(_join_levels, inputs, [parent])
+        run(_count_members, [cell_size, cell_count], [parent, members])
         # Labels.
-        run(_mark_clusters, [self._members, self._cell_count, self._parent, self.min_size], [head])
+        run(_mark_clusters, [members, cell_count, parent, self.min_size], [head])
         wp.utils.array_scan(head, rank, inclusive=True)
         run(
             _label_points,
-            [slot_of_point, self._cell_of_slot, head, rank],
-            [self._parent, *slots, self.labels, self.cluster_count],
+            [by_cell.slot_of_point[:n], by_cell.cell_of_slot, head, rank],
+            [parent, *by_cell.slots, self.labels, self.cluster_count],
         )
 
 
-def cluster(points: Any, radius: float, min_size: int = 1) -> Any:
+def cluster(points: Any, radius: float, min_size: int = 1, *, radius_per_metre: float = 0.0) -> Any:
     """Groups points that a chain of steps no longer than `radius` joins.
 
     The connected components of the graph of all pairs with distance ≤ radius, as float64 decides on the float32
     positions: the partition of a KD-tree's pairs and a graph search, or of DBSCAN with a single point as a core.
+
+    The points of a LiDAR lie the farther apart the farther they are. With `radius_per_metre` the radius at a point is
+    radius + radius_per_metre × its distance from the origin, and a pair is joined where its distance is at most the
+    smaller of the two radii, that of the point nearer to the origin: both points must reach each other.
 
     Args:
         points: Positions [m], shape (n, 3 or more), floating; NumPy, torch, Warp or DLPack. Columns after the third
             are ignored.
         radius: Longest step [m], > 0.
         min_size: Points that make a cluster.
+        radius_per_metre: By how much the radius grows per metre of range: 0, or from 1e-5 to 1; often 0.01.
 
     Returns:
         Labels, shape (n,), int32, of the same family and on the same device as `points`: clusters are numbered
@@ -425,13 +336,15 @@ def cluster(points: Any, radius: float, min_size: int = 1) -> Any:
 
     Raises:
         TypeError: `points` is not a floating array.
-        ValueError: `points` has not at least three columns, `radius` is not positive, or `min_size` is below 1.
+        ValueError: `points` has not at least three columns, `radius` is not positive, `min_size` is below 1, or
+            `radius_per_metre` is not from 0 to 1.
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
     plan = plan_for(
         EuclideanCluster,
         radius=float(radius),
+        radius_per_metre=float(radius_per_metre),
         min_size=int(min_size),
         capacity=capacity_for(n),
         device=borrowed.device,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cell_pairs import Radius, cell_of, differ, find, hash_cell, hash_column, is_finite, touch
+from .cell_pairs import Radius, cell_of, differ, find, hash_cell, hash_column, is_finite, join_levels, touch
 
-__all__ = ["gather_cells_in_order", "join_in_order", "label_in_order"]
+__all__ = ["gather_cells_in_order", "join_in_order", "join_levels_in_order", "label_in_order"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -232,6 +232,27 @@ def join_in_order(
                     if parent[stack[s][1]] != root:
                         root = -1
                 column_root[k] = root
+
+
+@wp.kernel
+def join_levels_in_order(
+    # in: of slots nothing, since the table has the cells themselves
+    cell_table: wp.array(dtype=wp.int32),
+    no_slots: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.vec3i),
+    cell_begin: wp.array(dtype=wp.int32),
+    cell_end: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    sizes: wp.array(dtype=wp.int32),
+    radius: Radius,
+    # in out: roots
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites cells of different levels that touch."""
+    for a in range(sizes[0]):
+        join_levels(a, cell_table, no_slots, cells, cell_begin, cell_end, points, radius, parent)
+    for c in range(sizes[0]):
+        parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
 
 
 @wp.kernel

@@ -30,6 +30,28 @@ def reference(points, radius, min_size=1):
     return labels
 
 
+def adaptive_reference(points, radius, per_metre, min_size=1):
+    """All pairs in float64, each with the radius at the point nearer to the origin; the labels by the lowest index."""
+    wide = points[:, :3].astype(np.float64)
+    x, y, z = wide.T
+    reach = radius + per_metre * np.sqrt(x * x + y * y + z * z)
+    rows, columns = [], []
+    for begin in range(0, len(wide), 256):
+        d = wide[begin : begin + 256, None] - wide[None]
+        squared = d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] + d[..., 2] * d[..., 2]
+        row, column = np.nonzero(squared <= np.minimum(reach[begin : begin + 256, None], reach[None]) ** 2)
+        rows.append(row + begin)
+        columns.append(column)
+    row, column = np.concatenate(rows or [[]]), np.concatenate(columns or [[]])
+    graph = coo_matrix((np.ones(len(row), bool), (row.astype(int), column.astype(int))), (len(wide),) * 2)
+    component = connected_components(graph, directed=False)[1] if len(wide) else np.zeros(0, int)
+    large = np.bincount(component)[component] >= min_size
+    labels = np.full(len(points), -1, np.int32)
+    _, first, inverse = np.unique(component[large], return_index=True, return_inverse=True)
+    labels[large] = np.argsort(np.argsort(first))[inverse]
+    return labels
+
+
 def launched(points, device="cpu", include=None, **fields):
     """The labels of a plan, launched twice so that what the first left is met."""
     plan = EuclideanCluster(capacity=max(len(points), 1), device=device, **fields)
@@ -160,6 +182,60 @@ def test_crowded_cells_do_not_take_the_square_of_their_points(method):
     assert launched(points, method=method, radius=0.5).max() + 1 == 2
 
 
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+@pytest.mark.parametrize(("radius", "per_metre"), [(0.3, 0.01), (0.1, 0.05), (0.02, 0.3), (0.01, 1.0), (1.0, 1e-5)])
+def test_a_radius_that_grows_with_the_range_joins_what_brute_force_does(device, method, radius, per_metre):
+    """Densities fall off with the range, so that the graph is between one cluster and none at all ranges."""
+    rng = np.random.default_rng(8)
+    direction = rng.normal(size=(2_500, 3)) * (1, 1, 0.2)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    points = (direction * 10.0 ** rng.uniform(-1, 2, (2_500, 1))).astype(np.float32)
+    fields = {"method": method, "radius": radius, "radius_per_metre": per_metre, "min_size": 2}
+    actual = launched(points, device, **fields)
+    np.testing.assert_array_equal(actual, adaptive_reference(points, radius, per_metre, 2))
+    assert actual.max() > 0 or per_metre == 1.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 150),
+    st.sampled_from([0.1, 0.3, 1.0]),
+    st.sampled_from([0.01, 0.1, 1.0]),
+    st.sampled_from([0.1, 0.5, 3.0]),
+    st.sampled_from([0.0, 30.0, -1e5]),
+)
+def test_a_growing_radius_on_grids_of_points(seed, n, radius, per_metre, step, offset):
+    """Duplicates, lines and planes of points, near and far, of equal distances and ranges."""
+    points = (np.random.default_rng(seed).integers(-9, 10, (n, 3)) * step + offset).astype(np.float32)
+    expected = adaptive_reference(points, radius, per_metre)
+    for method in ("in_order", "shared"):
+        actual = launched(points, method=method, radius=radius, radius_per_metre=per_metre)
+        np.testing.assert_array_equal(actual, expected)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(width=32)] * 3), max_size=40), st.sampled_from([1e-6, 0.5, 1e6]))
+def test_a_growing_radius_on_any_floats_at_all(rows, radius):
+    points = np.array(rows, np.float32).reshape(-1, 3)
+    finite = points[np.isfinite(points).all(axis=1)]
+    for per_metre in (1e-5, 0.02, 1.0):
+        expected = adaptive_reference(finite, radius, per_metre)
+        for method in ("in_order", "shared"):
+            actual = launched(finite, method=method, radius=radius, radius_per_metre=per_metre)
+            np.testing.assert_array_equal(actual, expected)
+            launched(points, method=method, radius=radius, radius_per_metre=per_metre)
+
+
+def test_a_growing_radius_on_a_crowd_and_on_a_real_scan(shared_data):
+    path = min((shared_data / "semantic_kitti" / "full").glob("08_*.bin"))
+    scan = np.fromfile(path, np.float32).reshape(-1, 4)[::30, :3]
+    crowd = np.random.default_rng(0).uniform(0, 0.5, (4_000, 3)).astype(np.float32)
+    for points in (scan, crowd + np.float32((40, 0, 0))):
+        expected = adaptive_reference(points, 0.3, 0.02)
+        np.testing.assert_array_equal(cluster(points, 0.3, radius_per_metre=0.02), expected)
+
+
 def test_a_pole_of_many_cells():
     """One column of cells, in no order: the sort by height does not take their square."""
     points = np.zeros((200_000, 3), np.float32)
@@ -201,6 +277,12 @@ def test_a_cluster_of_min_size_stays_and_a_smaller_one_goes():
 def test_a_wrong_argument_is_refused_by_name(arguments, message):
     with pytest.raises(ValueError, match=message):
         cluster(np.zeros((1, 3), np.float32), *arguments)
+
+
+@pytest.mark.parametrize("growth", [-0.01, 1e-6, 1.5, float("nan")])
+def test_a_growth_of_the_radius_out_of_bounds_is_refused(growth):
+    with pytest.raises(ValueError, match="radius_per_metre must be 0, or from 1e-05 to 1"):
+        cluster(np.zeros((1, 3), np.float32), 0.5, radius_per_metre=growth)
 
 
 def test_a_plan_refuses_what_does_not_fit():
