@@ -60,7 +60,8 @@ class BackgroundProcessor(Processor):
         """Boxes for one frame."""
         cloud, clusters, config = self.filtered.value, self.clusters.value, self._config
         labels = self._labels[: cloud.xyz.shape[0]]
-        label_outside_boxes(cloud.xyz, clusters.labels, cloud.count, self.foreground.value.boxes, config.margin, labels)
+        known = self.foreground.value.boxes if self.foreground.present else np.empty((0, 7), np.float32)
+        label_outside_boxes(cloud.xyz, clusters.labels, cloud.count, known, config.margin, labels)
         host_labels = labels.numpy()
         boxes = self._boxes(cloud, labels, clusters.count, trigger)
         long = np.flatnonzero(boxes[:, 3] > 1.5 * config.split_length)
