@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from .kernels.filters import Filtered, PointFilter, filter_points
     from .kernels.ground import Ground, GroundSegment, segment_ground
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
+    from .kernels.range_image import RangeImage, RangeProjection, range_image
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .models.head import DetectionHead
     from .models.tracker import Tracker, TrackerConfig, Tracks
@@ -45,6 +46,7 @@ _HOMES = {
     "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
+    "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "models.head": ("DetectionHead",),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
@@ -67,6 +69,8 @@ __all__ = [
     "PerceptionFrame",
     "Pipeline",
     "PointFilter",
+    "RangeImage",
+    "RangeProjection",
     "SourceError",
     "Tracker",
     "TrackerConfig",
@@ -82,6 +86,7 @@ __all__ = [
     "giou_3d",
     "iou_3d",
     "open_source",
+    "range_image",
     "read",
     "rotated_iou_bev",
     "segment_ground",
