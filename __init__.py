@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from .kernels.boxes import FitBoxes, fit_boxes
     from .kernels.cloud import Cloud
     from .kernels.cluster import EuclideanCluster, cluster
+    from .kernels.dbscan import Dbscan, dbscan
     from .kernels.downsample import VoxelDownsample, voxel_downsample
     from .kernels.filters import Filtered, PointFilter, filter_points
+    from .kernels.grid_cluster import GridCluster, grid_cluster
     from .kernels.ground import Ground, GroundSegment, segment_ground
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.range_image import RangeImage, RangeProjection, range_image
@@ -42,8 +44,10 @@ _HOMES = {
     "kernels.boxes": ("FitBoxes", "fit_boxes"),
     "kernels.cloud": ("Cloud",),
     "kernels.cluster": ("EuclideanCluster", "cluster"),
+    "kernels.dbscan": ("Dbscan", "dbscan"),
     "kernels.downsample": ("VoxelDownsample", "voxel_downsample"),
     "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
+    "kernels.grid_cluster": ("GridCluster", "grid_cluster"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
@@ -57,11 +61,13 @@ __all__ = [
     "BevMaps",
     "Cloud",
     "ConfigError",
+    "Dbscan",
     "DetectionHead",
     "DeviceError",
     "EuclideanCluster",
     "Filtered",
     "FitBoxes",
+    "GridCluster",
     "Ground",
     "GroundSegment",
     "Latency",
@@ -81,9 +87,11 @@ __all__ = [
     "WarploomError",
     "bev",
     "cluster",
+    "dbscan",
     "filter_points",
     "fit_boxes",
     "giou_3d",
+    "grid_cluster",
     "iou_3d",
     "open_source",
     "range_image",

@@ -24,6 +24,7 @@ __all__ = [
     "hash_cell",
     "hash_column",
     "is_finite",
+    "is_near",
     "join_levels",
     "radius_of",
     "touch",
@@ -148,7 +149,7 @@ def hash_column(x: int, y: int) -> int:
 
 
 @wp.func
-def _is_near(p: wp.vec3, q: wp.vec3, radius: Radius) -> bool:
+def is_near(p: wp.vec3, q: wp.vec3, radius: Radius) -> bool:
     """Whether the distance is within the radius, as float64 decides; float32 does where it is sure to agree."""
     x = p[0] - q[0]
     y = p[1] - q[1]
@@ -221,7 +222,7 @@ def _touch_large(
         p = points[i]
         if _gap_squared(p, b_low, b_high) <= radius.surely_not:
             for j in range(b_begin, b_end):
-                if _is_near(p, points[j], radius):
+                if is_near(p, points[j], radius):
                     return True
     return False
 
@@ -233,7 +234,7 @@ def _touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: i
     for i in range(a_begin, a_end):
         p = points[i]
         for j in range(b_begin, b_end):
-            if _is_near(p, points[j], radius):
+            if is_near(p, points[j], radius):
                 return True
     return False
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cell_pairs import Radius, cell_of, differ, hash_cell, is_finite
+from .cell_pairs import Radius, cell_of, differ, find, hash_cell, is_finite
 from .device import DEFAULT_DEVICE
 
-__all__ = ["CellTable", "free_slot"]
+__all__ = ["CellTable", "cell_at", "free_slot"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -27,6 +27,27 @@ def free_slot(
     table[slot] = -1
     lowest[slot] = _NO_POINT
     size[slot] = 0
+
+
+@wp.func
+def cell_at(
+    wanted: wp.vec3i,
+    table: wp.array(dtype=wp.int32),
+    cell_of_slot: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.vec3i),
+) -> int:
+    """The number of a cell, or -1 where it has no points."""
+    mask = table.shape[0] - 1
+    slot = hash_cell(wanted) & mask
+    cell = int(-1)
+    if table[slot] >= 0:
+        cell = cell_of_slot[slot]
+    while cell >= 0 and differ(cells[cell], wanted):
+        slot = (slot + 1) & mask
+        cell = -1
+        if table[slot] >= 0:
+            cell = cell_of_slot[slot]
+    return cell
 
 
 @wp.kernel
@@ -143,6 +164,68 @@ def _scatter_points(
             index[place] = i
 
 
+@wp.kernel
+def _count_members(
+    # in
+    cell_size: wp.array(dtype=wp.int32),
+    cell_count: wp.array(dtype=wp.int32),
+    # in out
+    parent: wp.array(dtype=wp.int32),
+    members: wp.array(dtype=wp.int32),
+):
+    c = wp.tid()
+    if c < cell_count[0]:
+        wp.atomic_add(members, find(parent, c), cell_size[c])
+
+
+@wp.kernel
+def _mark_clusters(
+    # in
+    members: wp.array(dtype=wp.int32),
+    cell_count: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
+    min_size: int,
+    # out
+    head_out: wp.array(dtype=wp.int32),
+):
+    """Marks the root cells of components with enough points."""
+    c = wp.tid()
+    head = int(0)
+    if c < cell_count[0] and parent[c] == c and members[c] >= min_size:
+        head = 1
+    head_out[c] = head
+
+
+@wp.kernel
+def _label_points(
+    # in
+    slot_of_point: wp.array(dtype=wp.int32),
+    cell_of_slot: wp.array(dtype=wp.int32),
+    head_in: wp.array(dtype=wp.int32),
+    rank_in: wp.array(dtype=wp.int32),
+    # in out: paths may be halved; the table is left free
+    parent: wp.array(dtype=wp.int32),
+    table: wp.array(dtype=wp.int32),
+    lowest: wp.array(dtype=wp.int32),
+    size: wp.array(dtype=wp.int32),
+    # out
+    labels_out: wp.array(dtype=wp.int32),
+    cluster_count_out: wp.array(dtype=wp.int32),
+):
+    """Hands each point the number of its component."""
+    i = wp.tid()
+    if i == head_in.shape[0] - 1:
+        cluster_count_out[0] = rank_in[i]
+    label = int(-1)
+    slot = slot_of_point[i]
+    if slot >= 0:
+        root = find(parent, cell_of_slot[slot])
+        if head_in[root] == 1:
+            label = rank_in[root] - 1
+        free_slot(slot, table, lowest, size)
+    labels_out[i] = label
+
+
 class CellTable:
     """Workspace to sort clouds of up to `capacity` points into cells; what is in it is for kernels to read."""
 
@@ -213,4 +296,27 @@ class CellTable:
             _scatter_points,
             [xyz, slot_of_point, self.cell_of_slot, self.cell_begin],
             [self._left, self.points, self.index],
+        )
+
+    def label(self, n: int, min_size: int, labels: wp.array, cluster_count: wp.array) -> None:
+        """Numbers the components that `parent` tells, by their lowest point, labels the points and frees the slots.
+
+        Args:
+            n: Points of the launch before, > 0.
+            min_size: Points that a component must have to get a number; the points of others get -1.
+            labels: Out: shape (n or more,), int32.
+            cluster_count: Out: shape (1,), int32.
+        """
+        head, rank, parent = self.head[:n], self.rank[:n], self.parent
+
+        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+            wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=labels.device)
+
+        run(_count_members, [self.cell_size, self.cell_count], [parent, self.members])
+        run(_mark_clusters, [self.members, self.cell_count, parent, min_size], [head])
+        wp.utils.array_scan(head, rank, inclusive=True)
+        run(
+            _label_points,
+            [self.slot_of_point[:n], self.cell_of_slot, head, rank],
+            [parent, *self.slots, labels, cluster_count],
         )

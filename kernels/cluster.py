@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .cell_pairs import Radius, differ, find, hash_cell, join_levels, radius_of, touch, unite
-from .cell_table import CellTable, free_slot
+from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
+from .cell_table import CellTable, cell_at
 from .cluster_columns import gather_cells_in_order, join_in_order, join_levels_in_order, label_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
@@ -50,19 +50,12 @@ def _join_cells(
     if a >= cell_count[0]:
         return
     wanted = cells[a] + offsets[o]
-    mask = table.shape[0] - 1
-    slot = hash_cell(wanted) & mask
-    while table[slot] >= 0:
-        b = cell_of_slot[slot]
-        if differ(cells[b], wanted):
-            slot = (slot + 1) & mask
-        else:
-            if find(parent, a) != find(parent, b):
-                a_begin = cell_begin[a]
-                b_begin = cell_begin[b]
-                if touch(points, a_begin, a_begin + cell_size[a], b_begin, b_begin + cell_size[b], radius):
-                    unite(parent, a, b)
-            return
+    b = cell_at(wanted, table, cell_of_slot, cells)
+    if b >= 0 and find(parent, a) != find(parent, b):
+        a_begin = cell_begin[a]
+        b_begin = cell_begin[b]
+        if touch(points, a_begin, a_begin + cell_size[a], b_begin, b_begin + cell_size[b], radius):
+            unite(parent, a, b)
 
 
 @wp.kernel
@@ -83,68 +76,6 @@ def _join_levels(
     a = wp.tid()
     if a < cell_count[0]:
         join_levels(a, table, cell_of_slot, cells, cell_begin, cell_end, points, radius, parent)
-
-
-@wp.kernel
-def _count_members(
-    # in
-    cell_size: wp.array(dtype=wp.int32),
-    cell_count: wp.array(dtype=wp.int32),
-    # in out
-    parent: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-):
-    c = wp.tid()
-    if c < cell_count[0]:
-        wp.atomic_add(members, find(parent, c), cell_size[c])
-
-
-@wp.kernel
-def _mark_clusters(
-    # in
-    members: wp.array(dtype=wp.int32),
-    cell_count: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    min_size: int,
-    # out
-    head_out: wp.array(dtype=wp.int32),
-):
-    """Marks the root cells of components with enough points."""
-    c = wp.tid()
-    head = int(0)
-    if c < cell_count[0] and parent[c] == c and members[c] >= min_size:
-        head = 1
-    head_out[c] = head
-
-
-@wp.kernel
-def _label_points(
-    # in
-    slot_of_point: wp.array(dtype=wp.int32),
-    cell_of_slot: wp.array(dtype=wp.int32),
-    head_in: wp.array(dtype=wp.int32),
-    rank_in: wp.array(dtype=wp.int32),
-    # in out: paths may be halved; the table is left free
-    parent: wp.array(dtype=wp.int32),
-    table: wp.array(dtype=wp.int32),
-    lowest: wp.array(dtype=wp.int32),
-    size: wp.array(dtype=wp.int32),
-    # out
-    labels_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-):
-    """Hands each point the number of its component."""
-    i = wp.tid()
-    if i == head_in.shape[0] - 1:
-        cluster_count_out[0] = rank_in[i]
-    label = int(-1)
-    slot = slot_of_point[i]
-    if slot >= 0:
-        root = find(parent, cell_of_slot[slot])
-        if head_in[root] == 1:
-            label = rank_in[root] - 1
-        free_slot(slot, table, lowest, size)
-    labels_out[i] = label
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,9 +217,8 @@ class EuclideanCluster:
 
     def _launch_shared(self, n: int) -> None:
         by_cell, radius = self._by_cell, self._radius
-        parent, members, cell_count = by_cell.parent, by_cell.members, by_cell.cell_count
+        parent, cell_count = by_cell.parent, by_cell.cell_count
         cell_size, cell_begin = by_cell.cell_size[:n], by_cell.cell_begin
-        head, rank = by_cell.head[:n], by_cell.rank[:n]
         found = [by_cell.table, by_cell.cell_of_slot]
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list, dim: int | tuple[int, int] = n) -> None:
@@ -301,15 +231,7 @@ class EuclideanCluster:
             wp.utils.array_scan(cell_size, self._cell_end[:n], inclusive=True)
             inputs = [*found, by_cell.cells, cell_begin, self._cell_end, by_cell.points, cell_count, radius]
             run(_join_levels, inputs, [parent])
-        run(_count_members, [cell_size, cell_count], [parent, members])
-        # Labels.
-        run(_mark_clusters, [members, cell_count, parent, self.min_size], [head])
-        wp.utils.array_scan(head, rank, inclusive=True)
-        run(
-            _label_points,
-            [by_cell.slot_of_point[:n], by_cell.cell_of_slot, head, rank],
-            [parent, *by_cell.slots, self.labels, self.cluster_count],
-        )
+        by_cell.label(n, self.min_size, self.labels, self.cluster_count)
 
 
 def cluster(points: Any, radius: float, min_size: int = 1, *, radius_per_metre: float = 0.0) -> Any:
