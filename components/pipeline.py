@@ -142,7 +142,7 @@ class Pipeline:
         profile = load_profile(name, of_profile)
         in_profile = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
         of_modules = {**in_profile, **{keys: value for keys, value in changes.items() if keys[0] != "profile"}}
-        modules = [load_module(find_config(module, "modules", CONF), of_modules) for module in profile.content.modules]
+        modules = [load_module(_find_module(profile, module), of_modules) for module in profile.content.modules]
         known = {component.name for module in modules for component in module.content.components}
         for keys in of_modules:
             if keys[0] not in known:
