@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -183,7 +184,7 @@ class BevMaps:
         )
 
 
-def bev(points: Any, point_range: Sequence[float], shape: Sequence[int]) -> Any:
+def bev(points: Any, point_range: Sequence[float], shape: Sequence[int], *, backend: str = "warp") -> Any:
     """Draws a cloud from above.
 
     Row 0 is at xmin and rows rise with x; column 0 is at ymin and columns rise with y. In a vehicle's frame, `maps[:,
@@ -194,6 +195,7 @@ def bev(points: Any, point_range: Sequence[float], shape: Sequence[int]) -> Any:
             the intensity is zero.
         point_range: xmin ymin zmin xmax ymax zmax [m] of the points drawn, upper bounds open.
         shape: Rows and columns.
+        backend: `warp`, or `taichi`, whose maps are the same.
 
     Returns:
         Three maps, shape (3, rows, columns), float32, of the family and on the device of `points`: z of the highest
@@ -202,9 +204,14 @@ def bev(points: Any, point_range: Sequence[float], shape: Sequence[int]) -> Any:
 
     Raises:
         TypeError: `points` is not a floating array.
-        ValueError: A shape or a number does not fit; the message says which.
+        ValueError: A shape or a number does not fit, or there is no such backend; the message says which.
+        ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
+    if uses_taichi(backend):
+        from .taichi import bev as in_taichi
+
+        return in_taichi.bev(borrowed, point_range, shape)
     plan = plan_for(
         BevMaps,
         capacity=capacity_for(len(borrowed)),

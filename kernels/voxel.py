@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -531,6 +532,8 @@ def voxelize(
     point_range: Sequence[float],
     max_points: int = 32,
     max_voxels: int = 40_000,
+    *,
+    backend: str = "warp",
 ) -> Voxels:
     """Sorts points into voxels, or pillars where a voxel is as high as the range; first come, first served.
 
@@ -543,13 +546,15 @@ def voxelize(
         point_range: xmin ymin zmin xmax ymax zmax [m]; upper bounds open.
         max_points: Points that a voxel keeps; later ones are dropped and counted.
         max_voxels: Voxels kept; later ones are dropped with their points and counted.
+        backend: `warp`, or `taichi`, whose voxels are the same.
 
     Returns:
         Features, coordinates and counts of the occupied voxels, on the device of `points`.
 
     Raises:
         TypeError: `points` is not a floating array.
-        ValueError: A shape or a number does not fit; the message says which.
+        ValueError: A shape or a number does not fit, or there is no such backend; the message says which.
+        ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
     edges = np.asarray(voxel_size, np.float64).ravel()
@@ -559,6 +564,10 @@ def voxelize(
     limits = tuple(float(limit) for limit in point_range)
     if len(limits) != 6:
         raise ValueError(f"point_range must have six numbers, xmin ymin zmin xmax ymax zmax, not {len(limits)}")
+    if uses_taichi(backend):
+        from .taichi import voxel as in_taichi
+
+        return in_taichi.voxelize(borrowed, size, limits, int(max_points), int(max_voxels))
     n, columns = borrowed.table.shape
     plan = plan_for(
         Voxelize,

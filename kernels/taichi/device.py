@@ -1,0 +1,145 @@
+"""Taichi's one runtime of a process: starts it, quietly and with arithmetic as Warp's, and allocates on its device.
+
+Where no arch is named it is the CPU, with all its threads, or what Taichi's own variable `TI_ARCH` says, such as
+`vulkan`. Compiled kernels are kept where Taichi keeps them, or in the folder `TI_OFFLINE_CACHE_FILE_PATH`: processes
+that run at the same time may share it, since Taichi locks it, and one that finds it locked compiles for itself.
+"""
+
+import contextlib
+import io
+import threading
+from functools import cache
+from typing import Any
+
+import numpy as np
+import taichi as ti
+import warp as wp
+from taichi.lang import impl
+
+from ...errors import DeviceError
+from ..device import DEFAULT_DEVICE
+from ..interop import Points, adopt, give
+
+__all__ = ["DEFAULT_TAICHI", "check_count", "give_back", "has_64_bits", "launching", "rows_of", "start", "workspace"]
+
+DEFAULT_TAICHI = "taichi"
+_ARCHS = ("cpu", "vulkan", "metal", "cuda")
+_CPU_ARCHS = ("x64", "arm64")
+
+launching = threading.RLock()
+"""Held while a kernel is launched, since Taichi's runtime serves one thread at a time."""
+
+_program: Any = None
+
+
+def start(device: str = DEFAULT_TAICHI, threads: int | None = None) -> str:
+    """Starts Taichi if nobody has, and says on which device it computes.
+
+    Args:
+        device: `taichi:cpu`, `taichi:vulkan`, `taichi:metal` or `taichi:cuda`; `taichi` alone is the one that is
+            running, or else the default.
+        threads: Of the CPU; all by default. Heeded only by the call that starts Taichi.
+
+    Returns:
+        The device's full name.
+
+    Raises:
+        ValueError: No name of a device.
+        DeviceError: Taichi cannot compute there, runs on another device already, or was started by someone else with
+            arithmetic too loose for these kernels.
+    """
+    global _program
+    library, _, arch = device.partition(":")
+    if library != DEFAULT_TAICHI or (arch not in _ARCHS and arch != ""):
+        names = ", ".join(f"'taichi:{name}'" for name in _ARCHS)
+        raise ValueError(f"device must be 'taichi' or one of {names}, not {device!r}")
+    with launching:
+        running = impl.get_runtime().prog
+        if running is None and _program is None:
+            _initialise(arch or "cpu", threads)
+            running = _program = impl.get_runtime().prog
+        elif _program is None:
+            if impl.current_cfg().fast_math:
+                raise DeviceError(
+                    "Taichi runs already, with fast_math, which changes results: start it with "
+                    "taichi.init(fast_math=False), or call warploom first and let it start Taichi"
+                )
+            _program = running
+        elif running is not _program:
+            raise DeviceError(
+                "Taichi has been reset (taichi.init or taichi.reset) since it computed for warploom, and with it "
+                "went warploom's workspaces; start it once, before the first call"
+            )
+        name = f"{DEFAULT_TAICHI}:{_arch_name()}"
+    if arch and name != f"{DEFAULT_TAICHI}:{arch}":
+        raise DeviceError(f"Taichi computes on one device in a process, here already on {name!r}, so not on {device!r}")
+    return name
+
+
+def _initialise(arch: str, threads: int | None) -> None:
+    options = {} if threads is None else {"cpu_max_num_threads": threads}
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets
+            ti.init(
+                arch=getattr(ti, arch),
+                enable_fallback=False,
+                default_fp=ti.f32,
+                default_ip=ti.i32,
+                # As in the Warp kernels: which cell a point falls into must not hang on what a compiler fuses.
+                fast_math=False,
+                log_level=ti.ERROR,
+                **options,
+            )
+    except RuntimeError as error:
+        raise DeviceError(f"Taichi cannot compute on 'taichi:{arch}' here: {error}") from error
+
+
+def _arch_name() -> str:
+    name = ti._lib.core.arch_name(impl.current_cfg().arch)
+    return "cpu" if name in _CPU_ARCHS else name
+
+
+@ti.kernel
+def _count_in_64_bits(number: ti.i32) -> ti.i32:
+    return ti.i32(ti.i64(ti.f64(number) * 0.5) + 1)
+
+
+@cache
+def has_64_bits() -> bool:
+    """Whether the running device has 64-bit floats and integers: Apple's GPUs, for one, have not."""
+    with launching:
+        try:
+            return _count_in_64_bits(4) == 3
+        except RuntimeError:  # so Taichi's compiler says that it has not
+            return False
+
+
+def workspace(shape: int | tuple[int, ...], dtype: Any) -> ti.Ndarray:
+    """An array on Taichi's device, zero."""
+    array = ti.ndarray(dtype, shape)
+    array.fill(0)
+    return array
+
+
+def check_count(count: int, points: Any, capacity: int) -> None:
+    """Raises a ValueError where `count` is more than there are points, or than the plan's capacity."""
+    most = min(points.shape[0], capacity)
+    if not 0 <= count <= most:
+        raise ValueError(
+            f"count must be 0 … {most}, with {points.shape[0]} rows and a capacity of {capacity}, not {count}"
+        )
+
+
+def rows_of(points: Points) -> np.ndarray:
+    """The borrowed table as Taichi takes it: on the host, contiguous, with at least one row."""
+    rows = points.table.numpy()
+    if not len(rows):
+        return np.zeros((1, points.table.shape[1]), np.float32)
+    return np.ascontiguousarray(rows)
+
+
+def give_back(host: np.ndarray, points: Points) -> Any:
+    """A fresh array of the host as one of the family, and on the device, of the points that were borrowed."""
+    if points.device == DEFAULT_DEVICE:
+        return adopt(host, points.family)
+    return give(wp.array(host, device=points.device), points.family)
