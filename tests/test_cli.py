@@ -8,15 +8,28 @@ import sys
 import numpy as np
 import pytest
 
+from warploom.cli import main
+
 EXAMPLES = pathlib.Path(__file__).resolve().parent.parent / "examples"
 
 
-def warploom(*arguments, cwd, expect=0):
-    """Runs the command and gives its output."""
-    command = [sys.executable, "-c", "from warploom.cli import main; main()", *map(str, arguments)]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True)
-    assert done.returncode == expect, done.stdout + done.stderr
-    return done.stdout + done.stderr
+@pytest.fixture
+def warploom(monkeypatch, capfd, tmp_path):
+    """Runs the command in this process, in the test's folder, and gives its output."""
+
+    def run(*arguments, expect=0):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["warploom", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+        output = "".join(capfd.readouterr())
+        assert code == expect, output
+        return output
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +45,14 @@ def scans(tmp_path_factory) -> pathlib.Path:
     return folder
 
 
-def test_demo_writes_objects_report_recording_and_picture(tmp_path):
-    output = warploom("demo", "--seconds", "0.5", "--out", "out", cwd=tmp_path)
+def test_the_installed_command_runs():
+    """The one test of the entry point itself, in a process of its own."""
+    command = [pathlib.Path(sys.executable).with_name("warploom"), "graph"]
+    assert "module perception" in subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_demo_writes_objects_report_recording_and_picture(warploom, tmp_path):
+    output = warploom("demo", "--seconds", "0.5", "--out", "out")
     assert "whole frame" in output
     assert "ground F1" in output
     lines = (tmp_path / "out" / "objects.jsonl").read_text().splitlines()
@@ -46,8 +65,8 @@ def test_demo_writes_objects_report_recording_and_picture(tmp_path):
     assert (tmp_path / "out" / "frame.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_run_keeps_the_frames_around_a_truncated_one_and_reports_it(scans, tmp_path):
-    warploom("run", "--source", f"kitti:{scans}", "--out", "out", cwd=tmp_path)
+def test_run_keeps_the_frames_around_a_truncated_one_and_reports_it(warploom, scans, tmp_path):
+    warploom("run", "--source", f"kitti:{scans}", "--out", "out")
     records = [json.loads(line) for line in (tmp_path / "out" / "objects.jsonl").read_text().splitlines()]
     assert [record["frame"] for record in records] == [0, 2, 3]
     keys = ["version", "frame", "objects", "missing_inputs", "frame_id", "velocity_reference", "latency_ms"]
@@ -57,9 +76,9 @@ def test_run_keeps_the_frames_around_a_truncated_one_and_reports_it(scans, tmp_p
     assert "000001.bin" in skipped[0]["path"]
 
 
-def test_the_same_run_twice_gives_the_same_objects(scans, tmp_path):
+def test_the_same_run_twice_gives_the_same_objects(warploom, scans, tmp_path):
     for out in ("a", "b"):
-        warploom("run", "--source", scans, "--out", out, "--no-mcap", cwd=tmp_path)
+        warploom("run", "--source", scans, "--out", out, "--no-mcap")
 
     def without_latency(name):
         records = [json.loads(line) for line in (tmp_path / name / "objects.jsonl").read_text().splitlines()]
@@ -68,8 +87,8 @@ def test_the_same_run_twice_gives_the_same_objects(scans, tmp_path):
     assert without_latency("a") == without_latency("b")
 
 
-def test_frames_limits_the_run(scans, tmp_path):
-    warploom("run", "--source", scans, "--out", "out", "--frames", 1, "--no-mcap", cwd=tmp_path)
+def test_frames_limits_the_run(warploom, scans, tmp_path):
+    warploom("run", "--source", scans, "--out", "out", "--frames", 1, "--no-mcap")
     assert len((tmp_path / "out" / "objects.jsonl").read_text().splitlines()) == 1
 
 
@@ -89,44 +108,44 @@ def test_frames_limits_the_run(scans, tmp_path):
         (["--log-level", "loud", "info"], 2, "none of debug"),
     ],
 )
-def test_bad_usage_says_what_and_ends_with_its_code(arguments, code, message, tmp_path):
-    assert message in " ".join(warploom(*arguments, cwd=tmp_path, expect=code).split())
+def test_bad_usage_says_what_and_ends_with_its_code(warploom, arguments, code, message):
+    assert message in " ".join(warploom(*arguments, expect=code).split())
 
 
-def test_a_wrong_key_in_a_module_file_names_file_line_and_the_nearest_key(tmp_path):
+def test_a_wrong_key_in_a_module_file_names_file_line_and_the_nearest_key(warploom, tmp_path):
     (tmp_path / "mine.yaml").write_text(
         "module: mine\ncomponents:\n  - name: a\n    kind: dag\n    trigger: sensor\n"
         "    inputs: {sensor: lidar/points}\n"
         "    graph:\n      filter:\n        processor: warploom.components.perception.FilterProcessor\n"
         "        config:\n          point_rnage: [0, 0, 0, 1, 1, 1]\n"
     )
-    output = warploom("check", "mine.yaml", cwd=tmp_path, expect=2)
+    output = warploom("check", "mine.yaml", expect=2)
     assert (
         "mine.yaml:11: components.0.graph.filter.config.point_rnage: unknown key; did you mean 'point_range'" in output
     )
 
 
-def test_check_accepts_what_ships(tmp_path):
-    assert "is good" in warploom("check", "cpu", cwd=tmp_path)
-    assert "is good" in warploom("check", "perception", cwd=tmp_path)
+def test_check_accepts_what_ships(warploom):
+    assert "is good" in warploom("check", "cpu")
+    assert "is good" in warploom("check", "perception")
 
 
-def test_graph_draws_text_and_mermaid(tmp_path):
-    text = warploom("graph", cwd=tmp_path)
+def test_graph_draws_text_and_mermaid(warploom):
+    text = warploom("graph")
     assert "filtered -> [ground] -> ground" in text
-    mermaid = warploom("graph", "perception", "--format", "mermaid", cwd=tmp_path)
+    mermaid = warploom("graph", "perception", "--format", "mermaid")
     assert mermaid.startswith("flowchart")
     assert "c_perception_filter -- filtered --> c_perception_ground" in mermaid
 
 
-def test_info_tells_the_machine_or_what_a_file_holds(scans, tmp_path):
-    assert "warp-lang" in warploom("info", cwd=tmp_path)
-    assert "4" in warploom("info", scans, cwd=tmp_path)
+def test_info_tells_the_machine_or_what_a_file_holds(warploom, scans):
+    assert "warp-lang" in warploom("info")
+    assert "4" in warploom("info", scans)
 
 
 @pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph"])
-def test_every_command_has_help_with_an_example(command, tmp_path):
-    assert "Example:" in warploom(command, "--help", cwd=tmp_path)
+def test_every_command_has_help_with_an_example(warploom, command):
+    assert "Example:" in warploom(command, "--help")
 
 
 def test_the_example_of_an_own_processor_runs():
