@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .kernels.grid_cluster import GridCluster, grid_cluster
     from .kernels.ground import Ground, GroundSegment, segment_ground
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
+    from .kernels.motion import MotionCompensation, compensate_motion
     from .kernels.range_image import RangeImage, RangeProjection, range_image
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .models.head import DetectionHead
@@ -50,6 +51,7 @@ _HOMES = {
     "kernels.grid_cluster": ("GridCluster", "grid_cluster"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
+    "kernels.motion": ("MotionCompensation", "compensate_motion"),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "models.head": ("DetectionHead",),
@@ -72,6 +74,7 @@ __all__ = [
     "GroundSegment",
     "Latency",
     "ModelError",
+    "MotionCompensation",
     "PerceptionFrame",
     "Pipeline",
     "PointFilter",
@@ -87,6 +90,7 @@ __all__ = [
     "WarploomError",
     "bev",
     "cluster",
+    "compensate_motion",
     "dbscan",
     "filter_points",
     "fit_boxes",
