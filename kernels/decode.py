@@ -48,7 +48,7 @@ def _count_peaks(
     peaks_out: wp.array(dtype=wp.int32),
 ):
     """Counts the peaks of each row of each class."""
-    kind, row = wp.tid()
+    kind, row = wp.tid()  # pyright: ignore[reportAssignmentType]
     found = int(0)
     for column in range(maps_in.shape[2]):
         if _is_peak(maps_in, kind, row, column, least):
@@ -76,7 +76,7 @@ def _write_boxes(
     dropped_out: wp.array(dtype=wp.int32),
 ):
     """Writes the boxes of each row of each class, from where the rows before it end."""
-    kind, row = wp.tid()
+    kind, row = wp.tid()  # pyright: ignore[reportAssignmentType]
     line = kind * maps_in.shape[1] + row
     capacity = scores_out.shape[0]
     if line == ends_in.shape[0] - 1:

@@ -100,7 +100,7 @@ def _iou_matrix(
     space_out: wp.array2d(dtype=wp.float32),
 ):
     """One pair a thread: intersection over union from above and in space."""
-    i, j = wp.tid()
+    i, j = wp.tid()  # pyright: ignore[reportAssignmentType]
     if i >= counts_in[0] or j >= counts_in[1]:
         return
     l0 = boxes_in[i, 3]
@@ -232,7 +232,7 @@ def _giou_matrix(
     giou_out: wp.array2d(dtype=wp.float32),
 ):
     """One pair a thread: generalised intersection over union in space."""
-    i, j = wp.tid()
+    i, j = wp.tid()  # pyright: ignore[reportAssignmentType]
     if i >= counts_in[0] or j >= counts_in[1]:
         return
     giou_out[i, j] = -1.0

@@ -52,7 +52,7 @@ def _overlap_bits(
     bits_out: wp.array2d(dtype=wp.uint32),
 ):
     """Bit j of row i: box j, later in the order than i, overlaps it too much."""
-    i, word = wp.tid()
+    i, word = wp.tid()  # pyright: ignore[reportAssignmentType]
     n = wp.min(count_in[0], boxes_in.shape[0])
     if i >= n or word * 32 >= n or word * 32 + 31 <= i:
         return

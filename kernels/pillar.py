@@ -24,13 +24,10 @@ PILLAR_SLICES = 15
 SLICE_HEIGHT = 0.25
 """Height of a slice [m]."""
 
-# A cell's sums are one row: (points, sum of z above the range [mm]) and (sums of dx, dy from the cell's corner
-# [1/4096 cell]), each pair packed in one number of 2 × 32 bits, then slice bits, the highest and lowest of these z.
-_POINTS_Z, _DX_DY, _BITS, _HIGH, _LOW, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 8))
-_HALF = wp.constant(wp.int64(32))
-_LOWER = wp.constant(wp.int64(0xFFFFFFFF))
-_FLOOR = wp.constant(wp.int64(-1))
-_CEILING = wp.constant(wp.int64(1_000_000))
+# A cell's sums are one row of 32 bytes: points, sums of z above the range [mm] and of dx, dy from the cell's corner
+# [1/4096 cell], slice bits, highest and lowest of these z.
+_POINTS, _Z, _DX, _DY, _BITS, _HIGH, _LOW, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 5, 6, 8))
+_CEILING = wp.constant(2**31 - 1)
 _SLICES = wp.constant(PILLAR_SLICES)
 _LAST_SLICE = wp.constant(PILLAR_SLICES - 1)
 
@@ -77,7 +74,7 @@ def _sum_pillars(
     inverse_slice: float,
     columns: int,
     # in out
-    sums: wp.array2d(dtype=wp.int64),
+    sums: wp.array2d(dtype=wp.int32),
     # out
     cells_out: wp.array(dtype=wp.int32),
     cell_count_out: wp.array(dtype=wp.int32),
@@ -99,16 +96,16 @@ def _sum_pillars(
     column = wp.min(int(u), columns - 1)
     row = wp.min(int(v), sums.shape[0] // columns - 1)
     cell = row * columns + column
-    above = wp.int64(int((z - low[2]) * 1000.0))
+    above = int((z - low[2]) * 1000.0)
     level = wp.where(z >= 0.0, wp.min(int(z * inverse_slice) + 1, _LAST_SLICE), 0)
-    if wp.atomic_add(sums, cell, _POINTS_Z, (wp.int64(1) << _HALF) + above) == wp.int64(0):
+    if wp.atomic_add(sums, cell, _POINTS, 1) == 0:
         cells_out[wp.atomic_add(cell_count_out, 0, 1)] = cell
-    dx = wp.int64((u - float(column)) * 4096.0)
-    dy = wp.int64((v - float(row)) * 4096.0)
-    wp.atomic_add(sums, cell, _DX_DY, (dx << _HALF) + dy)
+    wp.atomic_add(sums, cell, _Z, above)
+    wp.atomic_add(sums, cell, _DX, int((u - float(column)) * 4096.0))
+    wp.atomic_add(sums, cell, _DY, int((v - float(row)) * 4096.0))
     # These only ever grow, or fall: most points change nothing, and a plain read shows it.
-    bit = wp.int64(1 << level)
-    if (sums[cell, _BITS] & bit) == wp.int64(0):
+    bit = 1 << level
+    if sums[cell, _BITS] & bit == 0:
         wp.atomic_or(sums, cell, _BITS, bit)
     if sums[cell, _HIGH] < above:
         wp.atomic_max(sums, cell, _HIGH, above)
@@ -123,7 +120,7 @@ def _write_pillars(
     cell_count_in: wp.array(dtype=wp.int32),
     lowest: float,
     # in out
-    sums: wp.array2d(dtype=wp.int64),
+    sums: wp.array2d(dtype=wp.int32),
     grid: wp.array3d(dtype=wp.float32),
     # out
     bits_out: wp.array(dtype=wp.int32),
@@ -135,23 +132,19 @@ def _write_pillars(
     cell = cells_in[i]
     row = cell // grid.shape[2]
     column = cell - row * grid.shape[2]
-    bits = int(sums[cell, _BITS])
+    bits = sums[cell, _BITS]
     bits_out[i] = bits
     for s in range(_SLICES):
         if (bits >> s) & 1 != 0:
             grid[s, row, column] = 1.0
-    offsets = sums[cell, _DX_DY]
-    points_z = sums[cell, _POINTS_Z]
-    share = 1.0 / float(points_z >> _HALF)
-    grid[_SLICES, row, column] = float(offsets >> _HALF) * share / 4096.0 - 0.5
-    grid[_SLICES + 1, row, column] = float(offsets & _LOWER) * share / 4096.0 - 0.5
-    grid[_SLICES + 2, row, column] = float(points_z & _LOWER) * share / 1000.0 + lowest
+    share = 1.0 / float(sums[cell, _POINTS])
+    grid[_SLICES, row, column] = float(sums[cell, _DX]) * share / 4096.0 - 0.5
+    grid[_SLICES + 1, row, column] = float(sums[cell, _DY]) * share / 4096.0 - 0.5
+    grid[_SLICES + 2, row, column] = float(sums[cell, _Z]) * share / 1000.0 + lowest
     grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
     grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
-    sums[cell, _POINTS_Z] = wp.int64(0)
-    sums[cell, _DX_DY] = wp.int64(0)
-    sums[cell, _BITS] = wp.int64(0)
-    sums[cell, _HIGH] = _FLOOR
+    for k in range(_HIGH + 1):
+        sums[cell, k] = 0
     sums[cell, _LOW] = _CEILING
 
 
@@ -183,7 +176,7 @@ class PillarGrid:
             raise ValueError(f"point_range must be xmin ymin zmin xmax ymax zmax, not {self.point_range}")
         if self.capacity < 1:
             raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
-        if max(4096.0, (high[2] - low[2]) * 1000.0) * self.capacity >= 2**32:
+        if max(4096.0, (high[2] - low[2]) * 1000.0) * self.capacity >= 2**31:
             raise ValueError(
                 f"capacity {self.capacity} with heights {low[2]} … {high[2]} m overflows a sum of millimetres; "
                 "narrow the z of point_range"
@@ -197,8 +190,7 @@ class PillarGrid:
 
         buffer("grid", wp.zeros((1, PILLAR_SLICES + 5, rows, columns), dtype=wp.float32, device=device))
         buffer("_grid", self.grid[0])
-        buffer("_sums", wp.zeros((cells, int(_ROW)), dtype=wp.int64, device=device))
-        self._sums[:, int(_HIGH)].fill_(_FLOOR)
+        buffer("_sums", wp.zeros((cells, int(_ROW)), dtype=wp.int32, device=device))
         self._sums[:, int(_LOW)].fill_(_CEILING)
         buffer("cells", wp.zeros(min(self.capacity, cells), dtype=wp.int32, device=device))
         buffer("_bits", wp.zeros_like(self.cells))
