@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .ground_plane import FIRST_RING, RING_BITS, RINGS, SEGMENTS, GroundPlane, above, cell_of, lowest_point
 from .interop import adopt, borrow_points, count_on, give
@@ -325,7 +326,7 @@ class Ground:
     """Distance of the frame's origin from the plane of the ground near it [m]."""
 
 
-def segment_ground(points: Any, *, sensor_height: float | None = None) -> Ground:
+def segment_ground(points: Any, *, sensor_height: float | None = None, backend: str = "warp") -> Ground:
     """Tells the ground from what stands on it.
 
     The sensor may be tilted by up to 15°, the ground may be hilly, and points below it are told as noise (not ground).
@@ -336,17 +337,23 @@ def segment_ground(points: Any, *, sensor_height: float | None = None) -> Ground
         sensor_height: Height of the frame's origin above the ground [m], if known, to within 0.5 m: zero in a vehicle's
             frame that lies on the ground. By default it is estimated, and taken as 1.8 m where fewer than three patches
             between 2 and 32 m have points.
+        backend: `warp`, or `taichi`, whose heights are the same but for rounding.
 
     Returns:
         Mask and height, of the family and on the device of `points`, and the sensor's height.
 
     Raises:
         TypeError: `points` is not a floating array.
-        ValueError: It has not at least three columns, or `sensor_height` is not finite.
+        ValueError: It has not at least three columns, `sensor_height` is not finite, or there is no such backend.
+        ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
     height = None if sensor_height is None else float(sensor_height)
+    if uses_taichi(backend):
+        from .taichi import ground as in_taichi
+
+        return in_taichi.segment_ground(borrowed, height)
     plan = plan_for(GroundSegment, capacity=capacity_for(n), sensor_height=height, device=borrowed.device)
     count = count_on(n, borrowed.device)
     if borrowed.device != DEFAULT_DEVICE:

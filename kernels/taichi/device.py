@@ -87,7 +87,7 @@ def _initialise(arch: str, threads: int | None) -> None:
                 default_ip=ti.i32,
                 # As in the Warp kernels: which cell a point falls into must not hang on what a compiler fuses.
                 fast_math=False,
-                log_level=ti.ERROR,
+                log_level=ti.CRITICAL,  # what goes wrong is raised
                 **options,
             )
     except RuntimeError as error:
