@@ -1,0 +1,122 @@
+"""The shipped head: on scenes of unseen seeds, and on real scans, which it never saw; and its interface."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warploom.errors import ModelError
+from warploom.models.classes import CLASSES, VEHICLE
+from warploom.models.geometry import KittiCalibration, points_in_boxes
+from warploom.models.head import DetectionHead
+
+
+@pytest.fixture(scope="module")
+def head():
+    return DetectionHead(threads=2, score_threshold=0.3)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Random scenes from seeds that training does not use, with an HDL-64E, as (points, sensor height, frame)."""
+    from warploom.models.simulator import sample_scene
+    from warploom.models.training.frames import height_over_ground
+
+    frames = [sample_scene(seed, lidar="hdl64") for seed in (101, 102, 103)]
+    return [(f.points, height_over_ground(f.points, f.ground), f) for f in frames]
+
+
+def found_within(truth, found, distance):
+    if len(truth) == 0 or len(found) == 0:
+        return np.zeros(len(truth), bool)
+    return np.linalg.norm(truth[:, None, :2] - found[None, :, :2], axis=2).min(axis=1) < distance
+
+
+def test_it_finds_vehicles_in_scenes_it_has_not_seen(head, scenes):
+    """At least 80 % of those with 30 returns within 40 m, within 1 m."""
+    hits = total = 0
+    for points, height, frame in scenes:
+        seen = (frame.classes == VEHICLE) & (frame.counts >= 30) & (np.hypot(*frame.boxes[:, :2].T) < 40)
+        found = head.detect_points(points, height)
+        hits += found_within(frame.boxes[seen], found.boxes[found.classes == VEHICLE], 1.0).sum()
+        total += seen.sum()
+    assert total >= 10
+    assert hits >= 0.8 * total
+
+
+@pytest.mark.real
+def test_it_finds_cars_in_real_scans(head, shared_data):
+    """At least three in four of the labelled cars with 20 returns within 40 m, in KITTI's object scans."""
+    folder = shared_data / "kitti_object"
+    hits = total = 0
+    for path in sorted((folder / "velodyne").glob("*.bin")):
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        calibration = KittiCalibration.read(folder / "calib" / f"{path.stem}.txt")
+        rows = [line.split() for line in (folder / "label_2" / f"{path.stem}.txt").read_text().splitlines()]
+        cars = [[float(value) for value in row[8:15]] for row in rows if row[0] == "Car"]
+        if not cars:
+            continue
+        boxes = calibration.boxes_from_camera(np.array(cars))
+        seen = (points_in_boxes(points, boxes).sum(axis=1) >= 20) & (np.hypot(boxes[:, 0], boxes[:, 1]) < 40)
+        found = head.detect_points(points, 1.73)
+        hits += found_within(boxes[seen], found.boxes[found.classes == VEHICLE], 1.0).sum()
+        total += seen.sum()
+    assert total >= 15
+    assert hits >= 0.75 * total
+
+
+def test_what_it_says_is_whole(head, scenes):
+    points, height, _ = scenes[0]
+    found = head.detect_points(points, height)
+    assert len(found) > 0
+    assert found.boxes.shape == (len(found), 7)
+    assert found.boxes.dtype == found.scores.dtype == found.velocities.dtype == np.float32
+    assert found.classes.dtype == np.int32
+    assert np.isfinite(found.boxes).all()
+    assert (np.diff(found.scores) <= 0).all()
+    assert found.scores.min() >= 0.3
+    assert found.scores.max() <= 1.0
+    assert set(found.classes.tolist()) <= set(range(CLASSES.index("unknown")))
+    assert np.isnan(found.velocities).all()
+    assert not found.background.any()
+
+
+def test_the_same_scan_gives_the_same_bytes(head, scenes):
+    points, height, _ = scenes[1]
+    first = head.detect_points(points, height)
+    head.detect_points(scenes[0][0], scenes[0][1])
+    again = head.detect_points(points, height)
+    other = DetectionHead(threads=2, score_threshold=0.3).detect_points(points, height)
+    for found in (again, other):
+        assert found.boxes.tobytes() == first.boxes.tobytes()
+        assert found.scores.tobytes() == first.scores.tobytes()
+
+
+def test_both_faces_agree(head, scenes):
+    points, height, _ = scenes[0]
+    xyz = wp.array(np.ascontiguousarray(points[:, :3]), dtype=wp.vec3, device="cpu")
+    count = wp.array([len(points)], dtype=wp.int32, device="cpu")
+    on_device = head.detect(xyz, count, sensor_height=wp.array([height], dtype=wp.float32, device="cpu"))
+    assert on_device.boxes.tobytes() == head.detect_points(points, height).boxes.tobytes()
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 4)), np.zeros((1, 4)), np.full((9, 3), np.nan), np.full((9, 3), 1e9)])
+def test_little_or_no_cloud_gives_no_objects(head, points):
+    assert len(head.detect_points(points.astype(np.float32), 1.7)) == 0
+
+
+def test_a_higher_threshold_gives_fewer(head, scenes):
+    points, height, _ = scenes[0]
+    strict = DetectionHead(threads=2, score_threshold=0.6).detect_points(points, height)
+    assert len(strict) < len(head.detect_points(points, height))
+    assert strict.scores.min() >= 0.6
+
+
+def test_wrong_arguments_are_refused(head):
+    with pytest.raises(ValueError, match="score_threshold must be in"):
+        DetectionHead(score_threshold=1.5)
+    with pytest.raises(ValueError, match="threads must be"):
+        DetectionHead(threads=0)
+    with pytest.raises(ModelError, match="cannot read the head's card"):
+        DetectionHead("no_such_card.yaml")
+    with pytest.raises(ValueError, match="points must have shape"):
+        head.detect_points(np.zeros((3, 2), np.float32), 1.7)
