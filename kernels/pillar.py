@@ -25,8 +25,8 @@ SLICE_HEIGHT = 0.25
 """Height of a slice [m]."""
 
 # A cell's sums are one row of 32 bytes: points, sums of z above the range [mm] and of dx, dy from the cell's corner
-# [1/4096 cell], slice bits, highest and lowest of these z.
-_POINTS, _Z, _DX, _DY, _BITS, _HIGH, _LOW, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 5, 6, 8))
+# [1/4096 cell], slice bits, highest and lowest of these z, and the slice bits that the grid shows now.
+_POINTS, _Z, _DX, _DY, _BITS, _HIGH, _LOW, _SHOWN, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 5, 6, 7, 8))
 _CEILING = wp.constant(2**31 - 1)
 _SLICES = wp.constant(PILLAR_SLICES)
 _LAST_SLICE = wp.constant(PILLAR_SLICES - 1)
@@ -41,25 +41,27 @@ def pillar_channels() -> tuple[str, ...]:
 @wp.kernel
 def _clear_pillars(
     # in
-    cells_in: wp.array(dtype=wp.int32),
-    bits_in: wp.array(dtype=wp.int32),
-    cell_count_in: wp.array(dtype=wp.int32),
+    shown_in: wp.array(dtype=wp.uint32),
+    sums_in: wp.array2d(dtype=wp.int32),
     # in out
     grid: wp.array3d(dtype=wp.float32),
 ):
-    """Zeroes what the launch before wrote, and nothing else."""
+    """Zeroes what the launch before wrote, and nothing else; 32 neighbouring cells a thread."""
     i = wp.tid()
-    if i >= cell_count_in[0]:
+    occupied = shown_in[i]
+    if occupied == wp.uint32(0):
         return
-    cell = cells_in[i]
-    row = cell // grid.shape[2]
-    column = cell - row * grid.shape[2]
-    bits = bits_in[i]
-    for s in range(_SLICES):
-        if (bits >> s) & 1 != 0:
-            grid[s, row, column] = 0.0
-    for channel in range(_SLICES, _SLICES + 5):
-        grid[channel, row, column] = 0.0
+    for k in range(32):
+        if (occupied >> wp.uint32(k)) & wp.uint32(1) != wp.uint32(0):
+            cell = i * 32 + k
+            row = cell // grid.shape[2]
+            column = cell - row * grid.shape[2]
+            bits = sums_in[cell, _SHOWN]
+            for s in range(_SLICES):
+                if (bits >> s) & 1 != 0:
+                    grid[s, row, column] = 0.0
+            for channel in range(_SLICES, _SLICES + 5):
+                grid[channel, row, column] = 0.0
 
 
 @wp.kernel
@@ -75,11 +77,9 @@ def _sum_pillars(
     columns: int,
     # in out
     sums: wp.array2d(dtype=wp.int32),
-    # out
-    cells_out: wp.array(dtype=wp.int32),
-    cell_count_out: wp.array(dtype=wp.int32),
+    occupied: wp.array(dtype=wp.uint32),
 ):
-    """Adds each point to its cell; the first in a cell puts the cell on the list."""
+    """Adds each point to its cell; the first in a cell marks the cell as occupied."""
     i = wp.tid()
     if i >= count_in[0]:
         return
@@ -99,7 +99,7 @@ def _sum_pillars(
     above = int((z - low[2]) * 1000.0)
     level = wp.where(z >= 0.0, wp.min(int(z * inverse_slice) + 1, _LAST_SLICE), 0)
     if wp.atomic_add(sums, cell, _POINTS, 1) == 0:
-        cells_out[wp.atomic_add(cell_count_out, 0, 1)] = cell
+        wp.atomic_or(occupied, cell >> 5, wp.uint32(1) << wp.uint32(cell & 31))
     wp.atomic_add(sums, cell, _Z, above)
     wp.atomic_add(sums, cell, _DX, int((u - float(column)) * 4096.0))
     wp.atomic_add(sums, cell, _DY, int((v - float(row)) * 4096.0))
@@ -116,36 +116,43 @@ def _sum_pillars(
 @wp.kernel
 def _write_pillars(
     # in
-    cells_in: wp.array(dtype=wp.int32),
-    cell_count_in: wp.array(dtype=wp.int32),
     lowest: float,
     # in out
+    occupied: wp.array(dtype=wp.uint32),
     sums: wp.array2d(dtype=wp.int32),
     grid: wp.array3d(dtype=wp.float32),
     # out
-    bits_out: wp.array(dtype=wp.int32),
+    shown_out: wp.array(dtype=wp.uint32),
 ):
-    """Writes the channels of each cell on the list, and frees its row of sums for the next launch."""
+    """Writes the channels of the occupied cells, and frees their rows of sums for the next launch.
+
+    A thread takes 32 neighbouring cells, so that it writes along the rows of the grid, not across its channels.
+    """
     i = wp.tid()
-    if i >= cell_count_in[0]:
+    there = occupied[i]
+    shown_out[i] = there
+    occupied[i] = wp.uint32(0)
+    if there == wp.uint32(0):
         return
-    cell = cells_in[i]
-    row = cell // grid.shape[2]
-    column = cell - row * grid.shape[2]
-    bits = sums[cell, _BITS]
-    bits_out[i] = bits
-    for s in range(_SLICES):
-        if (bits >> s) & 1 != 0:
-            grid[s, row, column] = 1.0
-    share = 1.0 / float(sums[cell, _POINTS])
-    grid[_SLICES, row, column] = float(sums[cell, _DX]) * share / 4096.0 - 0.5
-    grid[_SLICES + 1, row, column] = float(sums[cell, _DY]) * share / 4096.0 - 0.5
-    grid[_SLICES + 2, row, column] = float(sums[cell, _Z]) * share / 1000.0 + lowest
-    grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
-    grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
-    for k in range(_HIGH + 1):
-        sums[cell, k] = 0
-    sums[cell, _LOW] = _CEILING
+    for k in range(32):
+        if (there >> wp.uint32(k)) & wp.uint32(1) != wp.uint32(0):
+            cell = i * 32 + k
+            row = cell // grid.shape[2]
+            column = cell - row * grid.shape[2]
+            bits = sums[cell, _BITS]
+            for s in range(_SLICES):
+                if (bits >> s) & 1 != 0:
+                    grid[s, row, column] = 1.0
+            share = 1.0 / float(sums[cell, _POINTS])
+            grid[_SLICES, row, column] = float(sums[cell, _DX]) * share / 4096.0 - 0.5
+            grid[_SLICES + 1, row, column] = float(sums[cell, _DY]) * share / 4096.0 - 0.5
+            grid[_SLICES + 2, row, column] = float(sums[cell, _Z]) * share / 1000.0 + lowest
+            grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
+            grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
+            for field in range(_HIGH + 1):
+                sums[cell, field] = 0
+            sums[cell, _LOW] = _CEILING
+            sums[cell, _SHOWN] = bits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,8 +162,6 @@ class PillarGrid:
     Attributes:
         grid: The network's input, shape (1, C, H, W), float32: channels of `pillar_channels`, rows along y, columns
             along x. Offsets in cells from the cell's centre, heights [m] above the ground.
-        cells: The cells that hold points, shape (capacity or H·W, the smaller), int32: row · W + column, no set order.
-        cell_count: How many they are, shape (1,), int32.
     """
 
     point_range: tuple[float, float, float, float, float, float] = (-60.0, -60.0, -2.0, 60.0, 60.0, 6.0)
@@ -192,9 +197,9 @@ class PillarGrid:
         buffer("_grid", self.grid[0])
         buffer("_sums", wp.zeros((cells, int(_ROW)), dtype=wp.int32, device=device))
         self._sums[:, int(_LOW)].fill_(_CEILING)
-        buffer("cells", wp.zeros(min(self.capacity, cells), dtype=wp.int32, device=device))
-        buffer("_bits", wp.zeros_like(self.cells))
-        buffer("cell_count", wp.zeros(1, dtype=wp.int32, device=device))
+        words = (cells + 31) // 32
+        buffer("_occupied", wp.zeros(words, dtype=wp.uint32, device=device))
+        buffer("_shown", wp.zeros(words, dtype=wp.uint32, device=device))
         buffer("_height", wp.zeros(1, dtype=wp.float32, device=device))
 
     @property
@@ -216,16 +221,9 @@ class PillarGrid:
         if not isinstance(height, wp.array):
             height = self._height
             height.fill_(float(sensor_height))
-        listed = self.cells.shape[0]
-        device = self.cells.device
-        wp.launch(
-            _clear_pillars,
-            listed,
-            inputs=[self.cells, self._bits, self.cell_count],
-            outputs=[self._grid],
-            device=device,
-        )
-        self.cell_count.zero_()
+        words = self._occupied.shape[0]
+        device = self.grid.device
+        wp.launch(_clear_pillars, words, inputs=[self._shown, self._sums], outputs=[self._grid], device=device)
         wp.launch(
             _sum_pillars,
             xyz.shape[0],
@@ -239,14 +237,14 @@ class PillarGrid:
                 1.0 / SLICE_HEIGHT,
                 self.grid.shape[3],
             ],
-            outputs=[self._sums, self.cells, self.cell_count],
+            outputs=[self._sums, self._occupied],
             device=device,
         )
         wp.launch(
             _write_pillars,
-            listed,
-            inputs=[self.cells, self.cell_count, self.point_range[2]],
-            outputs=[self._sums, self._grid, self._bits],
+            words,
+            inputs=[self.point_range[2]],
+            outputs=[self._occupied, self._sums, self._grid, self._shown],
             device=device,
         )
 
