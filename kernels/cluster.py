@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .backend import uses_taichi
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
 from .cluster_columns import gather_cells_in_order, join_in_order, join_levels_in_order, label_in_order
@@ -234,7 +235,9 @@ class EuclideanCluster:
         by_cell.label(n, self.min_size, self.labels, self.cluster_count)
 
 
-def cluster(points: Any, radius: float, min_size: int = 1, *, radius_per_metre: float = 0.0) -> Any:
+def cluster(
+    points: Any, radius: float, min_size: int = 1, *, radius_per_metre: float = 0.0, backend: str = "warp"
+) -> Any:
     """Groups points that a chain of steps no longer than `radius` joins.
 
     The connected components of the graph of all pairs with distance ≤ radius, as float64 decides on the float32
@@ -250,6 +253,7 @@ def cluster(points: Any, radius: float, min_size: int = 1, *, radius_per_metre: 
         radius: Longest step [m], > 0.
         min_size: Points that make a cluster.
         radius_per_metre: By how much the radius grows per metre of range: 0, or from 1e-5 to 1; often 0.01.
+        backend: `warp`, or `taichi`, whose labels are the same; it has one radius only.
 
     Returns:
         Labels, shape (n,), int32, of the same family and on the same device as `points`: clusters are numbered
@@ -259,10 +263,17 @@ def cluster(points: Any, radius: float, min_size: int = 1, *, radius_per_metre: 
     Raises:
         TypeError: `points` is not a floating array.
         ValueError: `points` has not at least three columns, `radius` is not positive, `min_size` is below 1, or
-            `radius_per_metre` is not from 0 to 1.
+            `radius_per_metre` is not from 0 to 1; or there is no such backend, or none with such a radius.
+        ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
+    if uses_taichi(backend):
+        from .taichi import cluster as in_taichi
+
+        if radius_per_metre != 0:
+            raise ValueError(f"radius_per_metre must be 0 with backend='taichi', not {radius_per_metre}")
+        return in_taichi.cluster(borrowed, float(radius), int(min_size))
     plan = plan_for(
         EuclideanCluster,
         radius=float(radius),

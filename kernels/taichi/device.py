@@ -59,10 +59,10 @@ def start(device: str = DEFAULT_TAICHI, threads: int | None = None) -> str:
             _initialise(arch or "cpu", threads)
             running = _program = impl.get_runtime().prog
         elif _program is None:
-            if impl.current_cfg().fast_math:
+            if impl.current_cfg().fast_math or not impl.get_runtime().short_circuit_operators:
                 raise DeviceError(
-                    "Taichi runs already, with fast_math, which changes results: start it with "
-                    "taichi.init(fast_math=False), or call warploom first and let it start Taichi"
+                    "Taichi runs already, with fast_math or without short_circuit_operators, which changes results: "
+                    "start it with taichi.init(fast_math=False), or call warploom first and let it start Taichi"
                 )
             _program = running
         elif running is not _program:
