@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.motion import MotionCompensation, compensate_motion
     from .kernels.range_image import RangeImage, RangeProjection, range_image
+    from .kernels.roi import PolygonMask, in_polygons
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .models.head import DetectionHead
     from .models.tracker import Tracker, TrackerConfig, Tracks
@@ -53,6 +54,7 @@ _HOMES = {
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.motion": ("MotionCompensation", "compensate_motion"),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
+    "kernels.roi": ("PolygonMask", "in_polygons"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "models.head": ("DetectionHead",),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
@@ -78,6 +80,7 @@ __all__ = [
     "PerceptionFrame",
     "Pipeline",
     "PointFilter",
+    "PolygonMask",
     "RangeImage",
     "RangeProjection",
     "SourceError",
@@ -96,6 +99,7 @@ __all__ = [
     "fit_boxes",
     "giou_3d",
     "grid_cluster",
+    "in_polygons",
     "iou_3d",
     "open_source",
     "range_image",
