@@ -1,4 +1,4 @@
-"""Voxel downsampling: one point per occupied voxel, the centroid of the points in it.
+"""Voxel downsampling: one point per occupied voxel, the centroid of the points in it, the first, or a random one.
 
 Centroids are summed in fixed point, so the result does not depend on the order in which threads run: the same bytes
 on every run, on a CPU and on a GPU. A CPU goes through the points once, in order; a GPU shares a hash table.
@@ -21,29 +21,45 @@ __all__ = ["VoxelDownsample", "voxel_downsample"]
 # Which voxel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_FARTHEST = wp.constant(wp.float32(2.0**20))  # [m]; float32 has steps of 6 cm there
-_LARGEST_CELL = wp.constant(wp.float32(2.0**30))
+_FARTHEST = 2.0**20  # [m]; float32 has steps of 6 cm there
+_LARGEST_CELL = 2.0**30
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))
 _NO_POINT = wp.constant(wp.int32(2**31 - 1))
+_NO_KEY = wp.constant(wp.int64(2**63 - 1))
+_FIRST = wp.constant(1)
+_MODES = ("centroid", "first", "random")
 # A voxel is one row, one cache line, of 64-bit numbers: cell x and y, cell z and slot, points, sums of x y z.
 _XY, _Z_SLOT, _COUNT, _SUM, _ROW_WIDTH = (wp.constant(i) for i in (0, 1, 2, 3, 8))
 
 
+@wp.struct
+class _Grid:
+    inverse_size: float  # 1 / the edge of a voxel
+    limit: float  # of a coordinate [m]: 2²⁰, or less where voxels are so small that they run out of numbers
+    scale: float  # fixed point numbers per metre, a power of two
+    mode: int
+    seed: wp.uint32
+
+
 @wp.func
-def _is_usable(point: wp.vec3, inverse_size: float) -> bool:
-    """Finite, within 2²⁰ m of the origin, and in a voxel that has a number; false for a NaN."""
-    reach = wp.max(wp.max(wp.abs(point[0]), wp.abs(point[1])), wp.abs(point[2]))
-    total = wp.abs(point[0]) + wp.abs(point[1]) + wp.abs(point[2])  # a maximum may hide a NaN, a sum does not
-    return total < 4.0 * _FARTHEST and reach < _FARTHEST and reach * inverse_size < _LARGEST_CELL
+def _is_usable(point: wp.vec3, limit: float) -> bool:
+    """Finite, and near enough to the origin to be in a voxel that has a number; false for a NaN."""
+    x = wp.abs(point[0])
+    y = wp.abs(point[1])
+    z = wp.abs(point[2])
+    # A maximum may hide a NaN, a sum does not.
+    return wp.max(wp.max(x, y), z) < limit and x + y + z < 4.0 * limit
+
+
+@wp.func
+def _floor(number: float) -> int:
+    whole = int(number)
+    return whole - wp.where(float(whole) > number, 1, 0)
 
 
 @wp.func
 def _cell_of(point: wp.vec3, inverse_size: float) -> wp.vec3i:
-    return wp.vec3i(
-        int(wp.floor(point[0] * inverse_size)),
-        int(wp.floor(point[1] * inverse_size)),
-        int(wp.floor(point[2] * inverse_size)),
-    )
+    return wp.vec3i(_floor(point[0] * inverse_size), _floor(point[1] * inverse_size), _floor(point[2] * inverse_size))
 
 
 @wp.func
@@ -53,12 +69,24 @@ def _differ(a: wp.vec3i, b: wp.vec3i) -> bool:
 
 @wp.func
 def _hash(cell: wp.vec3i) -> int:
-    mixed = (
-        wp.uint32(cell[0]) * wp.uint32(73856093)
-        ^ wp.uint32(cell[1]) * wp.uint32(19349669)
+    """Blocks of 8 × 8 × 1 cells are spread over the table; within one, neighbours in space share cache lines."""
+    block = (
+        wp.uint32(cell[0] >> 3) * wp.uint32(73856093)
+        ^ wp.uint32(cell[1] >> 3) * wp.uint32(19349669)
         ^ wp.uint32(cell[2]) * wp.uint32(83492791)
     )
-    return int((mixed * _SPREAD) >> wp.uint32(1))
+    within = ((cell[0] & 7) << 3) | (cell[1] & 7)
+    return int((((block * _SPREAD) >> wp.uint32(8)) << wp.uint32(6)) & wp.uint32(0x3FFFFFC0)) | within
+
+
+@wp.func
+def _key_of(point: int, seed: wp.uint32) -> wp.int64:
+    """A number drawn for a point, by MurmurHash3's finalizer, and the point: the least of a voxel's is chosen."""
+    drawn = wp.uint32(point) * wp.uint32(0x9E3779B9) + seed
+    drawn = (drawn ^ (drawn >> wp.uint32(16))) * wp.uint32(0x85EBCA6B)
+    drawn = (drawn ^ (drawn >> wp.uint32(13))) * wp.uint32(0xC2B2AE35)
+    drawn = (drawn ^ (drawn >> wp.uint32(16))) >> wp.uint32(1)
+    return (wp.int64(drawn) << wp.int64(32)) | wp.int64(point)
 
 
 @wp.func
@@ -77,13 +105,20 @@ def _centroid(sums: wp.array2d(dtype=wp.int64), row: int, scale: float) -> wp.ve
     )
 
 
+@wp.func
+def _add(rows: wp.array2d(dtype=wp.int64), voxel: int, points: wp.int64, x: wp.int64, y: wp.int64, z: wp.int64):
+    rows[voxel, _COUNT] = rows[voxel, _COUNT] + points
+    rows[voxel, _SUM] = rows[voxel, _SUM] + x
+    rows[voxel, _SUM + 1] = rows[voxel, _SUM + 1] + y
+    rows[voxel, _SUM + 2] = rows[voxel, _SUM + 2] + z
+
+
 @wp.kernel
 def _gather_in_order(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     count_in: wp.array(dtype=wp.int32),
-    inverse_size: float,
-    scale: float,
+    grid: _Grid,
     # in out: table of voxel numbers, -1 where free, and left so
     table: wp.array(dtype=wp.int32),
     rows: wp.array2d(dtype=wp.int64),
@@ -97,42 +132,108 @@ def _gather_in_order(
     voxels = int(0)
     dropped = int(0)
     voxel = int(-1)
-    xy_before = wp.int64(0)
-    z_before = wp.int64(0)
+    before = wp.vec3i(0, 0, 0)
+    # Neighbours in a scan are mostly neighbours in space: what a run of points adds to its voxel is added at once.
+    points = wp.int64(0)
+    x = wp.int64(0)
+    y = wp.int64(0)
+    z = wp.int64(0)
     for i in range(wp.min(count_in[0], xyz_in.shape[0])):
         point = xyz_in[i]
-        if _is_usable(point, inverse_size):
-            cell = _cell_of(point, inverse_size)
-            xy = (wp.int64(cell[0]) << wp.int64(32)) | wp.int64(wp.uint32(cell[1]))
-            z = wp.int64(cell[2])
-            # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if voxel < 0 or xy != xy_before or z != z_before:
-                xy_before = xy
-                z_before = z
+        if _is_usable(point, grid.limit):
+            cell = _cell_of(point, grid.inverse_size)
+            if voxel < 0 or _differ(cell, before):
+                if voxel >= 0:
+                    _add(rows, voxel, points, x, y, z)
+                points = wp.int64(0)
+                x = wp.int64(0)
+                y = wp.int64(0)
+                z = wp.int64(0)
+                before = cell
+                cell_xy = (wp.int64(cell[0]) << wp.int64(32)) | wp.int64(wp.uint32(cell[1]))
+                cell_z = wp.int64(cell[2])
                 slot = _hash(cell) & mask
                 voxel = table[slot]
-                while voxel >= 0 and (rows[voxel, _XY] != xy or (rows[voxel, _Z_SLOT] >> wp.int64(32)) != z):
+                while voxel >= 0 and (rows[voxel, _XY] != cell_xy or (rows[voxel, _Z_SLOT] >> wp.int64(32)) != cell_z):
                     slot = (slot + 1) & mask
                     voxel = table[slot]
                 if voxel < 0:
                     voxel = voxels
                     voxels += 1
                     table[slot] = voxel
-                    rows[voxel, _XY] = xy
-                    rows[voxel, _Z_SLOT] = (z << wp.int64(32)) | wp.int64(slot)
+                    rows[voxel, _XY] = cell_xy
+                    rows[voxel, _Z_SLOT] = (cell_z << wp.int64(32)) | wp.int64(slot)
                     rows[voxel, _COUNT] = wp.int64(0)
                     rows[voxel, _SUM] = wp.int64(0)
                     rows[voxel, _SUM + 1] = wp.int64(0)
                     rows[voxel, _SUM + 2] = wp.int64(0)
-            rows[voxel, _COUNT] = rows[voxel, _COUNT] + wp.int64(1)
-            rows[voxel, _SUM] = rows[voxel, _SUM] + _fixed(point[0], scale)
-            rows[voxel, _SUM + 1] = rows[voxel, _SUM + 1] + _fixed(point[1], scale)
-            rows[voxel, _SUM + 2] = rows[voxel, _SUM + 2] + _fixed(point[2], scale)
+            points += wp.int64(1)
+            x += _fixed(point[0], grid.scale)
+            y += _fixed(point[1], grid.scale)
+            z += _fixed(point[2], grid.scale)
+        else:
+            dropped += 1
+    if voxel >= 0:
+        _add(rows, voxel, points, x, y, z)
+    for v in range(voxels):
+        centroids_out[v] = _centroid(rows, v, grid.scale)
+        table[int(rows[v, _Z_SLOT] & wp.int64(0x7FFFFFFF))] = -1
+    centroid_count_out[0] = voxels
+    dropped_out[0] = dropped
+
+
+@wp.kernel
+def _choose_in_order(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    # in out: table of voxel numbers, -1 where free, and left so
+    table: wp.array(dtype=wp.int32),
+    cells: wp.array(dtype=wp.vec3i),
+    slots: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.int64),
+    # out
+    chosen_out: wp.array(dtype=wp.int32),
+    centroids_out: wp.array(dtype=wp.vec3),
+    centroid_count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """One thread, point after point: keeps of each voxel the first point, or the one with the least key."""
+    mask = table.shape[0] - 1
+    voxels = int(0)
+    dropped = int(0)
+    voxel = int(-1)
+    before = wp.vec3i(0, 0, 0)
+    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
+        point = xyz_in[i]
+        if _is_usable(point, grid.limit):
+            cell = _cell_of(point, grid.inverse_size)
+            if voxel < 0 or _differ(cell, before):
+                before = cell
+                slot = _hash(cell) & mask
+                voxel = table[slot]
+                while voxel >= 0 and _differ(cells[voxel], cell):
+                    slot = (slot + 1) & mask
+                    voxel = table[slot]
+                if voxel < 0:
+                    voxel = voxels
+                    voxels += 1
+                    table[slot] = voxel
+                    cells[voxel] = cell
+                    slots[voxel] = slot
+                    keys[voxel] = _NO_KEY
+                    chosen_out[voxel] = i
+            if grid.mode != _FIRST:
+                key = _key_of(i, grid.seed)
+                if key < keys[voxel]:
+                    keys[voxel] = key
+                    chosen_out[voxel] = i
         else:
             dropped += 1
     for v in range(voxels):
-        centroids_out[v] = _centroid(rows, v, scale)
-        table[int(rows[v, _Z_SLOT] & wp.int64(0x7FFFFFFF))] = -1
+        centroids_out[v] = xyz_in[chosen_out[v]]
+        table[slots[v]] = -1
     centroid_count_out[0] = voxels
     dropped_out[0] = dropped
 
@@ -142,12 +243,12 @@ def _gather_shared(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     count_in: wp.array(dtype=wp.int32),
-    inverse_size: float,
-    scale: float,
-    # in out: a table of points that stand for their voxels, -1 where free; lowest points; counts and sums
+    grid: _Grid,
+    # in out: a table of points that stand for their voxels, -1 where free; lowest points; sums or least keys, or null
     table: wp.array(dtype=wp.int32),
     lowest: wp.array(dtype=wp.int32),
     sums: wp.array2d(dtype=wp.int64),
+    keys: wp.array(dtype=wp.int64),
     # out
     slot_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
@@ -158,21 +259,24 @@ def _gather_shared(
     if i >= count_in[0]:
         return
     point = xyz_in[i]
-    if not _is_usable(point, inverse_size):
+    if not _is_usable(point, grid.limit):
         wp.atomic_add(dropped_out, 0, 1)
         return
-    cell = _cell_of(point, inverse_size)
+    cell = _cell_of(point, grid.inverse_size)
     mask = table.shape[0] - 1
     slot = _hash(cell) & mask
     found = wp.atomic_cas(table, slot, -1, i)
-    while found >= 0 and _differ(_cell_of(xyz_in[wp.max(found, 0)], inverse_size), cell):
+    while found >= 0 and _differ(_cell_of(xyz_in[wp.max(found, 0)], grid.inverse_size), cell):
         slot = (slot + 1) & mask
         found = wp.atomic_cas(table, slot, -1, i)
     slot_out[i] = slot
     wp.atomic_min(lowest, slot, i)
-    wp.atomic_add(sums, slot, _COUNT, wp.int64(1))
-    for axis in range(3):
-        wp.atomic_add(sums, slot, _SUM + axis, _fixed(point[axis], scale))
+    if sums:
+        wp.atomic_add(sums, slot, _COUNT, wp.int64(1))
+        for axis in range(3):
+            wp.atomic_add(sums, slot, _SUM + axis, _fixed(point[axis], grid.scale))
+    if keys:
+        wp.atomic_min(keys, slot, _key_of(i, grid.seed))
 
 
 @wp.kernel
@@ -195,30 +299,42 @@ def _mark_lowest(
 @wp.kernel
 def _emit_centroids(
     # in
+    xyz_in: wp.array(dtype=wp.vec3),
     slot_in: wp.array(dtype=wp.int32),
     head_in: wp.array(dtype=wp.int32),
     rank_in: wp.array(dtype=wp.int32),
-    scale: float,
+    grid: _Grid,
     # in out: left with all slots free again
     table: wp.array(dtype=wp.int32),
     lowest: wp.array(dtype=wp.int32),
     sums: wp.array2d(dtype=wp.int64),
+    keys: wp.array(dtype=wp.int64),
     # out
+    chosen_out: wp.array(dtype=wp.int32),
     centroids_out: wp.array(dtype=wp.vec3),
     centroid_count_out: wp.array(dtype=wp.int32),
 ):
-    """Writes one centroid per head, in the order of the heads, and frees the slots that were used."""
+    """Writes one point per head, in the order of the heads, and frees the slots that were used."""
     i = wp.tid()
     if i == head_in.shape[0] - 1:
         centroid_count_out[0] = rank_in[i]
     if head_in[i] == 0:
         return
     slot = slot_in[i]
-    centroids_out[rank_in[i] - 1] = _centroid(sums, slot, scale)
+    place = rank_in[i] - 1
+    if sums:
+        centroids_out[place] = _centroid(sums, slot, grid.scale)
+        for column in range(4):
+            sums[slot, _COUNT + column] = wp.int64(0)
+    else:
+        chosen = i
+        if keys:
+            chosen = int(keys[slot] & wp.int64(0x7FFFFFFF))
+            keys[slot] = _NO_KEY
+        chosen_out[place] = chosen
+        centroids_out[place] = xyz_in[chosen]
     table[slot] = -1
     lowest[slot] = _NO_POINT
-    for column in range(4):
-        sums[slot, _COUNT + column] = wp.int64(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,12 +345,19 @@ class VoxelDownsample:
     """Edge of a voxel [m], > 0."""
     capacity: int
     """Points that one launch can take."""
+    mode: str = "centroid"
+    """What stands for a voxel: the `centroid` of its points, the `first` of them, or one at `random`."""
+    seed: int = 0
+    """Of the mode `random`."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
     """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
     centroids: wp.array = field(init=False, repr=False, compare=False)
-    """Out: shape (capacity,), vec3 [m], ordered by the lowest index of a point in the voxel."""
+    """Out: shape (capacity,), vec3 [m], ordered by the lowest index of a point in the voxel; in the modes `first` and
+    `random` the points chosen."""
+    chosen: wp.array = field(init=False, repr=False, compare=False)
+    """Out: which points those are, shape (capacity,), int32; in the mode `centroid` its length is 0."""
     centroid_count: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (1,), int32, how many centroids there are."""
     dropped: wp.array = field(init=False, repr=False, compare=False)
@@ -246,29 +369,51 @@ class VoxelDownsample:
             raise ValueError(f"voxel_size must be > 0 m and finite, not {self.voxel_size}")
         if self.capacity < 1:
             raise ValueError(f"capacity must be at least 1, not {self.capacity}")
+        if self.mode not in _MODES:
+            raise ValueError(f"mode must be 'centroid', 'first' or 'random', not {self.mode!r}")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
         slots = 2 << (self.capacity - 1).bit_length()
+        centroids, random = self.mode == "centroid", self.mode == "random"
+        grid = _Grid()
+        grid.inverse_size = 1.0 / self.voxel_size
+        grid.limit = min(_FARTHEST, _LARGEST_CELL * self.voxel_size)
+        # As fine as leaves room for `capacity` points at 2²⁰ m in one sum of 63 bits.
+        grid.scale = 2.0 ** (43 - max(21, self.capacity.bit_length()))
+        grid.mode = _MODES.index(self.mode)
+        grid.seed = self.seed & 0xFFFFFFFF
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
 
+        def buffers(length: int, dtype: type, *names: str) -> None:
+            for name in names:
+                keep(name, wp.empty(length, dtype=dtype, device=device))
+
         keep("_sequential", sequential)
-        # As fine as leaves room for `capacity` points at 2²⁰ m in one sum of 63 bits.
-        keep("_scale", 2.0 ** (43 - max(21, self.capacity.bit_length())))
+        keep("_grid", grid)
         keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
-        keep("centroids", wp.empty(self.capacity, dtype=wp.vec3, device=device))
+        keep("_sums", None)
+        keep("_keys", None)
+        buffers(self.capacity, wp.vec3, "centroids")
+        buffers(0 if centroids else self.capacity, wp.int32, "chosen")
         keep("centroid_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("dropped", wp.zeros(1, dtype=wp.int32, device=device))
-        if sequential:
-            keep("_rows", wp.empty((self.capacity, _ROW_WIDTH), dtype=wp.int64, device=device))
-        else:
+        if not sequential:
             keep("_lowest", wp.full(slots, 2**31 - 1, dtype=wp.int32, device=device))
-            keep("_sums", wp.zeros((slots, _ROW_WIDTH), dtype=wp.int64, device=device))
-            for name in ("_slot", "_head", "_rank"):
-                keep(name, wp.empty(self.capacity, dtype=wp.int32, device=device))
+            buffers(self.capacity, wp.int32, "_slot", "_head", "_rank")
+            if centroids:
+                keep("_sums", wp.zeros((slots, _ROW_WIDTH), dtype=wp.int64, device=device))
+            elif random:
+                keep("_keys", wp.full(slots, 2**63 - 1, dtype=wp.int64, device=device))
+        elif centroids:
+            keep("_sums", wp.empty((self.capacity, _ROW_WIDTH), dtype=wp.int64, device=device))
+        else:
+            buffers(self.capacity, wp.vec3i, "_cells")
+            buffers(self.capacity, wp.int32, "_slots")
+            buffers(self.capacity, wp.int64, "_keys")
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -280,35 +425,32 @@ class VoxelDownsample:
         n = xyz.shape[0]
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
-        inverse_size = 1.0 / self.voxel_size
-        results = [self.centroids, self.centroid_count]
+
+        def run(kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+            wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
+
+        given, results = [xyz, count, self._grid], [self.centroids, self.centroid_count]
         if self._sequential:
-            wp.launch(
-                _gather_in_order,
-                1,
-                inputs=[xyz, count, inverse_size, self._scale],
-                outputs=[self._table, self._rows, *results, self.dropped],
-                device=self.device,
-            )
+            if self.mode == "centroid":
+                run(_gather_in_order, 1, given, [self._table, self._sums, *results, self.dropped])
+            else:
+                workspace = [self._table, self._cells, self._slots, self._keys]
+                run(_choose_in_order, 1, given, [*workspace, self.chosen, *results, self.dropped])
             return
         self.dropped.zero_()
         if n == 0:
             self.centroid_count.zero_()
             return
         slot, head, rank = self._slot[:n], self._head[:n], self._rank[:n]
-        shared = [self._table, self._lowest, self._sums]
-
-        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-            wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=self.device)
-
-        run(_gather_shared, [xyz, count, inverse_size, self._scale], [*shared, slot, self.dropped])
-        run(_mark_lowest, [slot, self._lowest], [head])
+        shared = [self._table, self._lowest, self._sums, self._keys]
+        run(_gather_shared, n, given, [*shared, slot, self.dropped])
+        run(_mark_lowest, n, [slot, self._lowest], [head])
         wp.utils.array_scan(head, rank, inclusive=True)
-        run(_emit_centroids, [slot, head, rank, self._scale], [*shared, *results])
+        run(_emit_centroids, n, [xyz, slot, head, rank, self._grid], [*shared, self.chosen, *results])
 
 
-def voxel_downsample(points: Any, voxel_size: float) -> Any:
-    """Replaces the points of each voxel by their centroid.
+def voxel_downsample(points: Any, voxel_size: float, mode: str = "centroid", *, seed: int = 0) -> Any:
+    """Replaces the points of each voxel by one.
 
     A point's voxel is floor(position × (1 / voxel_size)) in float32. Points that are not finite, or more than 2²⁰ m
     (1049 km) off the origin along an axis, are skipped.
@@ -317,17 +459,27 @@ def voxel_downsample(points: Any, voxel_size: float) -> Any:
         points: Positions [m], shape (n, 3 or more), floating; NumPy, torch, Warp or DLPack. Columns after the third
             are ignored.
         voxel_size: Edge of a voxel [m], > 0.
+        mode: What stands for a voxel: the `centroid` of its points, the `first` of them, or one at `random`, any of
+            them with the same chance.
+        seed: Of the mode `random`: with the same seed, the same points are chosen, on every device.
 
     Returns:
-        Centroids [m], shape (m, 3), float32, m ≤ n, ordered by the lowest index of a point in the voxel; of the same
+        Positions [m], shape (m, 3), float32, m ≤ n, ordered by the lowest index of a point in the voxel; of the same
         family and on the same device as `points` (a Warp array is one of vec3, shape (m,)).
 
     Raises:
         TypeError: `points` is not a floating array.
-        ValueError: `points` has not at least three columns, or `voxel_size` is not positive.
+        ValueError: `points` has not at least three columns, `voxel_size` is not positive, or `mode` is not known.
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
-    plan = plan_for(VoxelDownsample, voxel_size=float(voxel_size), capacity=capacity_for(n), device=borrowed.device)
+    plan = plan_for(
+        VoxelDownsample,
+        voxel_size=float(voxel_size),
+        mode=mode,
+        seed=int(seed) if mode == "random" else 0,
+        capacity=capacity_for(n),
+        device=borrowed.device,
+    )
     plan.launch(borrowed.xyz, count_on(n, borrowed.device))
     return give(plan.centroids[: int(plan.centroid_count.numpy()[0])], borrowed.family)

@@ -28,6 +28,26 @@ def launched(points, device="cpu", **fields):
     return plan.centroids.numpy()[: int(plan.centroid_count.numpy()[0])], int(plan.dropped.numpy()[0])
 
 
+def drawn(n, seed):
+    """The numbers that the mode `random` draws: MurmurHash3's finalizer of index × golden ratio + seed."""
+    h = (np.arange(n, dtype=np.uint64) * 0x9E3779B9 + (seed & 0xFFFFFFFF)) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x85EBCA6B) & 0xFFFFFFFF
+    h = ((h ^ (h >> 13)) * 0xC2B2AE35) & 0xFFFFFFFF
+    return (h ^ (h >> 16)) >> 1
+
+
+def chosen_reference(points, voxel_size, mode, seed):
+    """The indices chosen, in order of each voxel's first point."""
+    cells = np.floor(points[:, :3].astype(np.float32) * np.float32(1.0 / voxel_size)).astype(np.int64)
+    order = np.lexsort(
+        (np.arange(len(points)), drawn(len(points), seed) if mode == "random" else np.zeros(len(points)))
+    )
+    _, first, voxel = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    best = np.full(len(first), -1)
+    best[voxel.ravel()[order[::-1]]] = order[::-1]
+    return best[np.argsort(first)]
+
+
 def street(seed, n=60_000):
     return np.random.default_rng(seed).normal(0, [30, 30, 2, 1], (n, 4)).astype(np.float32)
 
@@ -96,6 +116,46 @@ def test_cells_below_zero_are_not_folded_onto_those_above():
     np.testing.assert_allclose(voxel_downsample(points, 1.0), [[-0.5, 0, 0], [0.1, 0, 0]], atol=1e-6)
 
 
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+@pytest.mark.parametrize(("mode", "seed"), [("first", 0), ("random", 0), ("random", 1), ("random", -7)])
+def test_chosen_points_are_those_of_the_reference(device, method, mode, seed):
+    points = street(9)
+    points[::1000, 1] = np.nan
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    plan = VoxelDownsample(capacity=len(points), device=device, method=method, mode=mode, seed=seed, voxel_size=0.8)
+    for order in (points[::-1], points):
+        xyz = wp.array(np.ascontiguousarray(order[:, :3]), dtype=wp.vec3, device=device)
+        plan.launch(xyz, count_on(len(points), device))
+    m = int(plan.centroid_count.numpy()[0])
+    chosen = plan.chosen.numpy()[:m]
+    if mode == "first":
+        np.testing.assert_array_equal(chosen, finite[chosen_reference(points[finite], 0.8, mode, seed)])
+    else:
+        # Draws are by the index among all points: those that are left out take no part.
+        marked = points.copy()
+        marked[~np.isfinite(points).all(axis=1), :3] = 1e6
+        expected = chosen_reference(marked, 0.8, mode, seed)
+        np.testing.assert_array_equal(chosen, expected[np.abs(marked[expected, 0]) < 1e5])
+    np.testing.assert_array_equal(plan.centroids.numpy()[:m], points[chosen, :3])
+    np.testing.assert_array_equal(voxel_downsample(points, 0.8, mode, seed=seed), points[chosen, :3])
+
+
+def test_random_choice_is_even_and_hangs_on_the_seed():
+    """Each of 8 points of a voxel is chosen about one time in 8: 4 standard deviations of the binomial."""
+    points = np.zeros((2_000, 8, 3), np.float32)
+    points[..., 0] = np.arange(8) / 16
+    points[..., 1] = np.arange(2_000)[:, None]
+    picks = [voxel_downsample(points.reshape(-1, 3), 1.0, "random", seed=seed)[:, 0] * 16 for seed in range(3)]
+    for pick in picks:
+        assert np.abs(np.bincount(pick.astype(int), minlength=8) - 250).max() < 4 * np.sqrt(2_000 / 8 * 7 / 8)
+    assert 0.08 < np.mean(picks[0] == picks[1]) < 0.17
+
+
+def test_an_unknown_mode_is_refused():
+    with pytest.raises(ValueError, match="mode must be 'centroid', 'first' or 'random', not 'median'"):
+        voxel_downsample(np.zeros((1, 3), np.float32), 1.0, "median")
+
+
 @pytest.mark.parametrize("size", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_size_that_is_not_positive_is_refused(size):
     with pytest.raises(ValueError, match="voxel_size must be > 0"):
@@ -111,9 +171,10 @@ def test_a_plan_refuses_what_does_not_fit():
         VoxelDownsample(voxel_size=1.0, capacity=10).launch(wp.zeros(11, wp.vec3, device="cpu"), count_on(11, "cpu"))
 
 
+@pytest.mark.parametrize("mode", ["centroid", "first", "random"])
 @pytest.mark.parametrize("method", ["in_order", "shared"])
-def test_a_captured_launch_replays_on_other_points(device, method):
-    plan = VoxelDownsample(voxel_size=2.0, capacity=500, device=device, method=method)
+def test_a_captured_launch_replays_on_other_points(device, method, mode):
+    plan = VoxelDownsample(voxel_size=2.0, capacity=500, device=device, method=method, mode=mode)
     xyz = wp.array(street(20, 500)[:, :3], dtype=wp.vec3, device=device)
     count = count_on(500, device)
     plan.launch(xyz, count)
