@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .kernels.cluster import EuclideanCluster, cluster
     from .kernels.dbscan import Dbscan, dbscan
     from .kernels.downsample import VoxelDownsample, voxel_downsample
+    from .kernels.dynamic_voxel import DynamicVoxelize, DynamicVoxels, dynamic_voxelize
     from .kernels.filters import Filtered, PointFilter, filter_points
     from .kernels.grid_cluster import GridCluster, grid_cluster
     from .kernels.ground import Ground, GroundSegment, segment_ground
@@ -48,6 +49,7 @@ _HOMES = {
     "kernels.cluster": ("EuclideanCluster", "cluster"),
     "kernels.dbscan": ("Dbscan", "dbscan"),
     "kernels.downsample": ("VoxelDownsample", "voxel_downsample"),
+    "kernels.dynamic_voxel": ("DynamicVoxelize", "DynamicVoxels", "dynamic_voxelize"),
     "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
     "kernels.grid_cluster": ("GridCluster", "grid_cluster"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
@@ -68,6 +70,8 @@ __all__ = [
     "Dbscan",
     "DetectionHead",
     "DeviceError",
+    "DynamicVoxelize",
+    "DynamicVoxels",
     "EuclideanCluster",
     "Filtered",
     "FitBoxes",
@@ -95,6 +99,7 @@ __all__ = [
     "cluster",
     "compensate_motion",
     "dbscan",
+    "dynamic_voxelize",
     "filter_points",
     "fit_boxes",
     "giou_3d",

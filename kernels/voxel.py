@@ -7,7 +7,6 @@ large. A GPU gets the same bytes from a stable sort by cell. Both clear only wha
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +18,8 @@ from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .voxel_grid import VoxelGrid, cell_number, grid_of, slot_of, voxel_of, write_coords
+from .voxel_sort import VoxelSort
 
 __all__ = ["Voxelize", "Voxels", "voxelize"]
 
@@ -27,46 +28,6 @@ wp.set_module_options({"fuse_fp": False})
 
 _DENSE_CELLS = 1 << 22  # of 4 bytes: larger grids miss the cache more than a hash table does
 _DROPPED_POINTS, _DROPPED_VOXELS, _OUTSIDE = (wp.constant(i) for i in range(3))
-_SPREAD = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
-_OUT_OF_GRID = wp.constant(wp.int64(-1))
-
-
-@wp.struct
-class _Grid:
-    low: wp.vec3
-    high: wp.vec3
-    size: wp.vec3
-    cells: wp.vec3i  # along x y z
-    total: wp.int64
-
-
-@wp.func
-def _cell_of(point: wp.vec3, grid: _Grid) -> wp.int64:
-    """The row-major cell of a point, x fastest, or -1. Every comparison is false for a NaN."""
-    cell = _OUT_OF_GRID
-    if (
-        point[0] >= grid.low[0]
-        and point[1] >= grid.low[1]
-        and point[2] >= grid.low[2]
-        and point[0] < grid.high[0]
-        and point[1] < grid.high[1]
-        and point[2] < grid.high[2]
-    ):
-        x = int((point[0] - grid.low[0]) / grid.size[0])
-        y = int((point[1] - grid.low[1]) / grid.size[1])
-        z = int((point[2] - grid.low[2]) / grid.size[2])
-        if x < grid.cells[0] and y < grid.cells[1] and z < grid.cells[2]:
-            cell = (wp.int64(z) * wp.int64(grid.cells[1]) + wp.int64(y)) * wp.int64(grid.cells[0]) + wp.int64(x)
-    return cell
-
-
-@wp.func
-def _write_coords(cell: wp.int64, grid: _Grid, voxel: int, coords: wp.array2d(dtype=wp.int32)):
-    row = cell / wp.int64(grid.cells[0])
-    layer = row / wp.int64(grid.cells[1])
-    coords[voxel, 0] = int(layer)
-    coords[voxel, 1] = int(row - layer * wp.int64(grid.cells[1]))
-    coords[voxel, 2] = int(cell - row * wp.int64(grid.cells[0]))
 
 
 @wp.func
@@ -93,7 +54,7 @@ def _assign_in_order(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     count_in: wp.array(dtype=wp.int32),
-    grid: _Grid,
+    grid: VoxelGrid,
     dense: int,
     max_points: int,
     max_voxels: int,
@@ -116,34 +77,44 @@ def _assign_in_order(
     voxels = int(0)
     crowded = int(0)
     outside = int(0)
+    row = int(-1)
+    before = wp.vec3i(-1, -1, -1)
     for i in range(wp.min(count_in[0], xyz_in.shape[0])):
         place = int(-1)
-        cell = _cell_of(xyz_in[i], grid)
-        if cell < wp.int64(0):
+        voxel = voxel_of(xyz_in[i], grid)
+        if voxel[0] < 0:
             outside += 1
         else:
-            slot = int(cell)
-            if dense == 0:
-                slot = int((wp.uint64(cell) * _SPREAD) >> wp.uint64(34)) & mask
-            voxel = table[slot]
-            if dense == 0:
-                while voxel >= 0 and cell_of_voxel[voxel] != cell:
-                    slot = (slot + 1) & mask
-                    voxel = table[slot]
-            if voxel < 0:
-                voxel = voxels
-                voxels += 1
-                table[slot] = voxel
-                slot_of_voxel[voxel] = slot
-                cell_of_voxel[voxel] = cell
-                if voxel < max_voxels:
-                    counts_out[voxel] = 0
-                    _write_coords(cell, grid, voxel, coords_out)
-            if voxel < max_voxels:
-                rank = counts_out[voxel]
+            # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
+            if voxel[0] != before[0] or voxel[1] != before[1] or voxel[2] != before[2]:
+                before = voxel
+                slot = int(0)
+                cell = wp.int64(0)
+                if dense != 0:
+                    slot = (voxel[2] * grid.cells[1] + voxel[1]) * grid.cells[0] + voxel[0]
+                    row = table[slot]
+                else:
+                    cell = cell_number(voxel, grid)
+                    slot = slot_of(cell, mask)
+                    row = table[slot]
+                    while row >= 0 and cell_of_voxel[row] != cell:
+                        slot = (slot + 1) & mask
+                        row = table[slot]
+                if row < 0:
+                    row = voxels
+                    voxels += 1
+                    table[slot] = row
+                    slot_of_voxel[row] = slot
+                    if dense == 0:
+                        cell_of_voxel[row] = cell
+                    if row < max_voxels:
+                        counts_out[row] = 0
+                        write_coords(voxel, row, coords_out)
+            if row < max_voxels:
+                rank = counts_out[row]
                 if rank < max_points:
-                    place = voxel * max_points + rank
-                    counts_out[voxel] = rank + 1
+                    place = row * max_points + rank
+                    counts_out[row] = rank + 1
                 else:
                     crowded += 1
         place_out[i] = place
@@ -195,71 +166,11 @@ def _fill(
 
 
 @wp.kernel
-def _sort_keys(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    grid: _Grid,
-    # out
-    key_out: wp.array(dtype=wp.int64),
-    point_out: wp.array(dtype=wp.int32),
-    first_out: wp.array(dtype=wp.int32),
-    dropped_out: wp.array(dtype=wp.int32),
-):
-    """The cell of each point; points without one get the number after the last, and sort to the end."""
-    i = wp.tid()
-    key = grid.total
-    if i < count_in[0]:
-        cell = _cell_of(xyz_in[i], grid)
-        if cell >= wp.int64(0):
-            key = cell
-        else:
-            wp.atomic_add(dropped_out, _OUTSIDE, 1)
-    key_out[i] = key
-    point_out[i] = i
-    first_out[i] = 0
-
-
-@wp.kernel
-def _mark_heads(
-    # in
-    key_in: wp.array(dtype=wp.int64),
-    point_in: wp.array(dtype=wp.int32),
-    grid: _Grid,
-    # out
-    head_out: wp.array(dtype=wp.int32),
-    first_out: wp.array(dtype=wp.int32),
-):
-    """Marks where a cell begins among the sorted points, and the lowest point of each cell among all points."""
-    j = wp.tid()
-    head = int(0)
-    key = key_in[j]
-    if key < grid.total and (j == 0 or key_in[j - 1] != key):
-        head = 1
-    head_out[j] = head
-    if head == 1:
-        first_out[point_in[j]] = 1
-
-
-@wp.kernel
-def _mark_starts(
-    # in
-    head_in: wp.array(dtype=wp.int32),
-    segment_in: wp.array(dtype=wp.int32),
-    # out
-    start_out: wp.array(dtype=wp.int32),
-):
-    j = wp.tid()
-    if head_in[j] == 1:
-        start_out[segment_in[j] - 1] = j
-
-
-@wp.kernel
 def _fill_sorted(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     extra_in: wp.array2d(dtype=wp.float32),
-    grid: _Grid,
+    grid: VoxelGrid,
     max_points: int,
     max_voxels: int,
     key_in: wp.array(dtype=wp.int64),
@@ -294,7 +205,7 @@ def _fill_sorted(
     else:
         wp.atomic_add(dropped_out, _DROPPED_POINTS, 1)
     if rank == 0:
-        _write_coords(key, grid, voxel, coords_out)
+        write_coords(voxel_of(xyz_in[point_in[j]], grid), voxel, coords_out)
     if j == last or key_in[j + 1] != key:
         counts_out[voxel] = wp.min(rank + 1, max_points)
 
@@ -333,7 +244,7 @@ class Voxelize:
 
     def __post_init__(self):
         """Checks the numbers and makes the workspace."""
-        grid = _grid(self.voxel_size, self.point_range)
+        grid = grid_of(self.voxel_size, self.point_range)
         for name, least in (("columns", 3), ("max_points", 1), ("max_voxels", 1), ("capacity", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
@@ -373,11 +284,8 @@ class Voxelize:
             keep("_numbered", wp.zeros(1, dtype=wp.int32, device=device))
             buffer("_place", self.capacity, wp.int32)
         else:
-            keep("_bits", int(grid.total).bit_length())
-            buffer("_key", 2 * self.capacity, wp.int64)
-            buffer("_point", 2 * self.capacity, wp.int32)
-            for name in ("_first", "_number", "_head", "_segment", "_start"):
-                buffer(name, self.capacity, wp.int32)
+            keep("_sorted", VoxelSort(grid, self.capacity, device))
+            keep("_outside", self.dropped[int(_OUTSIDE) :])
 
     def launch(self, xyz: wp.array, count: wp.array, extra: wp.array | None = None) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -453,56 +361,18 @@ class Voxelize:
         if n == 0:
             self.voxel_count.zero_()
             return
-        first, number, head = self._first[:n], self._number[:n], self._head[:n]
-        segment = self._segment[:n]
-
-        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-            wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=self.device)
-
-        run(_sort_keys, [xyz, count, self._grid], [self._key, self._point, first, self.dropped])
-        wp.utils.radix_sort_pairs(self._key, self._point, n, end_bit=self._bits)
-        run(_mark_heads, [self._key, self._point, self._grid], [head, first])
-        wp.utils.array_scan(head, segment, inclusive=True)
-        wp.utils.array_scan(first, number, inclusive=True)
-        run(_mark_starts, [head, segment], [self._start])
-        run(
+        by_voxel = self._sorted
+        by_voxel.launch(xyz, count, self._outside)
+        wp.launch(
             _fill_sorted,
-            [
+            n,
+            inputs=[
                 *(xyz, extra, self._grid, self.max_points, self.max_voxels),
-                *(self._key, self._point, segment, self._start, number),
+                *(by_voxel.key, by_voxel.point, by_voxel.segment[:n], by_voxel.start, by_voxel.number[:n]),
             ],
-            [self._features, self.coords, self.counts, self.voxel_count, self.dropped],
+            outputs=[self._features, self.coords, self.counts, self.voxel_count, self.dropped],
+            device=self.device,
         )
-
-
-def _grid(voxel_size: Sequence[float], point_range: Sequence[float]) -> _Grid:
-    """The cells that `point_range` is cut into.
-
-    Raises:
-        ValueError: An edge that is not positive, a range that is empty or not finite, or far too many cells.
-    """
-    low, high = point_range[:3], point_range[3:]
-    cells = []
-    for axis, size, start, stop in zip("xyz", voxel_size, low, high, strict=True):
-        if not (size > 0 and math.isfinite(size)):
-            raise ValueError(f"voxel_size must be > 0 m and finite, not {size} along {axis}")
-        if not (start < stop and math.isfinite(start) and math.isfinite(stop)):
-            raise ValueError(
-                f"point_range must be xmin ymin zmin xmax ymax zmax with min < max, not {start} … {stop} along {axis}"
-            )
-        ratio = (stop - start) / size
-        # A range that is a whole number of voxels, but for the rounding of its decimals, has just that number.
-        whole = round(ratio)
-        cells.append(whole if whole > 0 and abs(ratio - whole) < 1e-3 else math.ceil(ratio))
-        if cells[-1] > 1 << 20:
-            raise ValueError(
-                f"point_range has {cells[-1]} voxels along {axis}, more than 2²⁰; choose a larger voxel_size"
-            )
-    grid = _Grid()
-    grid.low, grid.high, grid.size = wp.vec3(*low), wp.vec3(*high), wp.vec3(*voxel_size)
-    grid.cells = wp.vec3i(*cells)
-    grid.total = math.prod(cells)
-    return grid
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ import taichi as ti
 
 from ..interop import Points
 from ..plan import capacity_for, plan_for
-from ..voxel import Voxels, _grid
+from ..voxel import Voxels
+from ..voxel_grid import grid_of
 from .device import DEFAULT_TAICHI, check_count, give_back, launching, rows_of, start, workspace
 from .parallel import NO_POINT, block_sums_for, hash_of, scan
 
@@ -257,7 +258,7 @@ class Voxelize:
 
     def __post_init__(self):
         """Checks the numbers and makes the workspace."""
-        grid = _grid(self.voxel_size, self.point_range)
+        grid = grid_of(self.voxel_size, self.point_range)
         for name, least in (("columns", 3), ("max_points", 1), ("max_voxels", 1), ("capacity", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
