@@ -22,8 +22,10 @@ _NO_POINT = 2**31 - 1
 
 @ti.func
 def _in_order(z: ti.f32) -> ti.i32:
-    """The bits of a float as an integer in the same order; adding zero makes −0 equal 0."""
-    bits = ti.bit_cast(z + 0.0, ti.i32)
+    """The bits of a float as an integer in the same order, −0 as 0."""
+    bits = ti.bit_cast(z, ti.i32)
+    if bits == _LOWEST_BITS:
+        bits = 0
     return bits ^ ((bits >> 31) & 0x7FFFFFFF)
 
 

@@ -3,11 +3,14 @@
 Where no arch is named it is the CPU, with all its threads, or what Taichi's own variable `TI_ARCH` says, such as
 `vulkan`. Compiled kernels are kept where Taichi keeps them, or in the folder `TI_OFFLINE_CACHE_FILE_PATH`: processes
 that run at the same time may share it, since Taichi locks it, and one that finds it locked compiles for itself.
+
+On a CPU, Taichi's own threads take denormal numbers for zero.
 """
 
 import contextlib
 import io
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any
 
@@ -77,21 +80,30 @@ def start(device: str = DEFAULT_TAICHI, threads: int | None = None) -> str:
 
 
 def _initialise(arch: str, threads: int | None) -> None:
-    options = {} if threads is None else {"cpu_max_num_threads": threads}
+    # In a thread of its own: Taichi makes the thread that starts it flush denormal numbers to zero from then on, and
+    # what NumPy and Warp compute must not change by that.
+    with ThreadPoolExecutor(1) as starter:
+        started = starter.submit(_run_taichi, arch, {} if threads is None else {"cpu_max_num_threads": threads})
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets
-            ti.init(
-                arch=getattr(ti, arch),
-                enable_fallback=False,
-                default_fp=ti.f32,
-                default_ip=ti.i32,
-                # As in the Warp kernels: which cell a point falls into must not hang on what a compiler fuses.
-                fast_math=False,
-                log_level=ti.CRITICAL,  # what goes wrong is raised
-                **options,
-            )
+        started.result()
     except RuntimeError as error:
         raise DeviceError(f"Taichi cannot compute on 'taichi:{arch}' here: {error}") from error
+
+
+def _run_taichi(arch: str, options: dict[str, int]) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):  # it greets
+        ti.init(
+            arch=getattr(ti, arch),
+            enable_fallback=False,
+            default_fp=ti.f32,
+            default_ip=ti.i32,
+            # As in the Warp kernels: which cell a point falls into must not hang on what a compiler fuses.
+            fast_math=False,
+            log_level=ti.CRITICAL,  # what goes wrong is raised
+            **options,
+        )
+    # What only the thread that has started it can do; kernels may then be launched by any.
+    impl.get_runtime().materialize()
 
 
 def _arch_name() -> str:
