@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import numpy as np
 import warp as wp
 
 from .device import DEFAULT_DEVICE
@@ -11,6 +10,7 @@ from .device import DEFAULT_DEVICE
 __all__ = ["label_outside_boxes", "select_heights"]
 
 _NONE = wp.constant(-1)
+_UPLOADED = (wp.float32, wp.int32, wp.int32)
 
 
 @wp.kernel
@@ -54,6 +54,8 @@ def _label_outside_boxes(
     labels_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     boxes_in: wp.array2d(dtype=wp.float32),
+    start_in: wp.array(dtype=wp.int32),
+    box_in: wp.array(dtype=wp.int32),
     margin: float,
     # out
     labels_out: wp.array(dtype=wp.int32),
@@ -62,9 +64,12 @@ def _label_outside_boxes(
     label = int(_NONE)
     if i < count_in[0]:
         label = labels_in[i]
-    if label >= 0:
+    if label >= 0 and label + 1 < start_in.shape[0]:
         point = xyz_in[i]
-        for k in range(boxes_in.shape[0]):
+        first = start_in[label]
+        last = start_in[label + 1]
+        for j in range(first, last):
+            k = box_in[j]
             x = point[0] - boxes_in[k, 0]
             y = point[1] - boxes_in[k, 1]
             half_length = 0.5 * boxes_in[k, 3] + margin
@@ -79,22 +84,47 @@ def _label_outside_boxes(
 
 
 def label_outside_boxes(
-    xyz: wp.array, labels: wp.array, count: wp.array, boxes: Any, margin: float, outside: wp.array
+    xyz: wp.array,
+    labels: wp.array,
+    count: wp.array,
+    boxes: np.ndarray,
+    cluster_boxes: np.ndarray,
+    margin: float,
+    outside: wp.array,
 ) -> None:
     """Takes the points inside boxes out of their clusters.
+
+    A point is tried against those boxes alone that the box of its cluster comes near.
 
     Args:
         xyz: Positions [m], shape (n,), vec3.
         labels: Of the clusters, shape (n,), int32.
         count: Number of points, shape (1,), int32, on the device.
-        boxes: x y z l w h [m], yaw [rad], shape (k, 7), float32: a Warp array on the device, or NumPy on a CPU.
+        boxes: x y z l w h [m], yaw [rad], shape (k, 7), float32.
+        cluster_boxes: Likewise, by label, each around its cluster; points of labels without one keep their label.
         margin: By how much each box is grown on every side [m].
         outside: Filled with the labels, −1 for points in a box, shape (n,), int32.
     """
     device = outside.device
-    if not isinstance(boxes, wp.array):
-        boxes = wp.array(
-            boxes, dtype=wp.float32, shape=(len(boxes), 7), device=device, copy=str(device) != DEFAULT_DEVICE
-        )
-    inputs = [xyz, labels, count, boxes, margin]
+    reach = [_extent(b) for b in (cluster_boxes, boxes)]
+    with np.errstate(invalid="ignore"):  # a label without points has no box: NaN is near nothing
+        apart = np.abs(cluster_boxes[:, None, :2] - boxes[None, :, :2])
+        near = (apart <= reach[0][:, None] + reach[1][None] + 2.0 * margin + 0.1).all(axis=2)
+    start = np.concatenate([[0], near.sum(axis=1).cumsum()])
+
+    hosts = (
+        np.ascontiguousarray(boxes, np.float32).reshape(-1, 7),
+        start.astype(np.int32),
+        np.nonzero(near)[1].astype(np.int32),
+    )
+    is_host = str(device) == DEFAULT_DEVICE
+    uploads = [wp.array(h, dtype=t, device=device, copy=not is_host) for h, t in zip(hosts, _UPLOADED, strict=True)]
+    inputs = [xyz, labels, count, *uploads, margin]
     wp.launch(_label_outside_boxes, outside.shape[0], inputs, [outside], device=device)
+
+
+def _extent(boxes: np.ndarray) -> np.ndarray:
+    """How far each box reaches along x and y from its centre, shape (k, 2)."""
+    c, s = np.abs(np.cos(boxes[:, 6])), np.abs(np.sin(boxes[:, 6]))
+    length, width = boxes[:, 3] / 2, boxes[:, 4] / 2
+    return np.stack([c * length + s * width, s * length + c * width], axis=1)

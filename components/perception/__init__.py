@@ -1,6 +1,7 @@
 """The stages of perception as processors, each of which can be named in a module file and run alone."""
 
 from .background import BackgroundProcessor
+from .cluster_boxes import ClusterBoxProcessor
 from .clustering import ClusterProcessor
 from .detection import DetectionProcessor
 from .filtering import FilterProcessor
@@ -11,6 +12,7 @@ from .tracking import TrackingProcessor
 
 __all__ = [
     "BackgroundProcessor",
+    "ClusterBoxProcessor",
     "ClusterProcessor",
     "DetectionProcessor",
     "FilterProcessor",
