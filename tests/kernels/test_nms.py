@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from warploom.kernels.iou import rotated_iou_bev
 from warploom.kernels.nms import RotatedNms, rotated_nms
 
