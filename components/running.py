@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ..errors import SinkError, SourceError
+from ..errors import ConfigError, SinkError, SourceError
 from .machine import describe_machine
 from .pipeline import PerceptionFrame, Pipeline
 from .report import RunReport
@@ -53,15 +53,18 @@ def run_to_folder(
         The report, as it is in `report.json`.
 
     Raises:
-        ConfigError: Profile, settings or source make no sense.
-        SourceError: The source cannot be read, or gave no frame.
+        ConfigError: Profile, settings or source make no sense, or there is nothing at the source.
+        SourceError: The source broke off, or gave no frame.
         SinkError: The outputs cannot be written.
     """
     console = Console(stderr=True)
     started = time.perf_counter()
     settings = list(settings)
     with console.status("preparing"):
-        source = open_source(uri, device=device)
+        try:
+            source = open_source(uri, device=device)
+        except SourceError as error:  # nothing is there to run on: the caller's mistake, not a run that failed
+            raise ConfigError(f"--source {error}") from error
         pipeline = Pipeline.from_profile(profile, device=device, settings=settings)
         try:
             out.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,10 @@ __all__ = ["Voxelize", "Voxels", "voxelize"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
+_LEAST_ROOM = 4096  # voxels
 _DENSE_CELLS = 1 << 22  # of 4 bytes: larger grids miss the cache more than a hash table does
+_LINE = wp.constant(16)  # floats of a cache line, which a CPU clears at once
+_line = wp.types.vector(length=16, dtype=wp.float32)
 _DROPPED_POINTS, _DROPPED_VOXELS, _OUTSIDE = (wp.constant(i) for i in range(3))
 
 
@@ -49,28 +52,46 @@ def _write_features(
         features[base + 3 + column] = extra[point, column]
 
 
+@wp.func
+def _clear(voxel: int, per_voxel: int, features: wp.array(dtype=wp.float32), lines: wp.array(dtype=_line)):
+    """Zeroes the features of a voxel."""
+    if lines:
+        per_line = per_voxel / _LINE
+        for k in range(voxel * per_line, (voxel + 1) * per_line):
+            lines[k] = _line()
+    else:
+        for k in range(voxel * per_voxel, (voxel + 1) * per_voxel):
+            features[k] = 0.0
+
+
 @wp.kernel
-def _assign_in_order(
+def _voxelize_in_order(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
+    extra_in: wp.array2d(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     grid: VoxelGrid,
     dense: int,
     max_points: int,
     max_voxels: int,
-    # in out: table of voxel numbers, -1 where free; what the launch before has put there
+    # in out: table of voxel numbers, -1 where free; what the launch before has put there, and how many voxels it has
+    # filled, or null where the features are new
     table: wp.array(dtype=wp.int32),
     slot_of_voxel: wp.array(dtype=wp.int32),
     cell_of_voxel: wp.array(dtype=wp.int64),
     numbered: wp.array(dtype=wp.int32),
-    # out
-    place_out: wp.array(dtype=wp.int32),
+    filled: wp.array(dtype=wp.int32),
+    # out: the features twice, the second time in lines, or null where a voxel is not a whole number of them
+    features_out: wp.array(dtype=wp.float32),
+    lines_out: wp.array(dtype=_line),
     coords_out: wp.array2d(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
     voxel_count_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
 ):
-    """One thread, point after point: gives each its place among the features, or -1."""
+    """One thread, point after point. Clears a voxel when it is met first, when it is about to be written."""
+    per_voxel = max_points * (extra_in.shape[1] + 3)
+    room = features_out.shape[0] / per_voxel
     for old in range(numbered[0]):
         table[slot_of_voxel[old]] = -1
     mask = table.shape[0] - 1
@@ -80,7 +101,6 @@ def _assign_in_order(
     row = int(-1)
     before = wp.vec3i(-1, -1, -1)
     for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        place = int(-1)
         voxel = voxel_of(xyz_in[i], grid)
         if voxel[0] < 0:
             outside += 1
@@ -110,59 +130,26 @@ def _assign_in_order(
                     if row < max_voxels:
                         counts_out[row] = 0
                         write_coords(voxel, row, coords_out)
+                        if row < room:
+                            _clear(row, per_voxel, features_out, lines_out)
             if row < max_voxels:
                 rank = counts_out[row]
                 if rank < max_points:
-                    place = row * max_points + rank
                     counts_out[row] = rank + 1
+                    if row < room:
+                        _write_features(xyz_in, extra_in, i, row * max_points + rank, features_out)
                 else:
                     crowded += 1
-        place_out[i] = place
     numbered[0] = voxels
-    voxel_count_out[0] = wp.min(voxels, max_voxels)
+    voxels_kept = wp.min(voxels, max_voxels)
+    if filled:
+        for old in range(voxels_kept, filled[0]):
+            _clear(old, per_voxel, features_out, lines_out)
+        filled[0] = voxels_kept
+    voxel_count_out[0] = voxels_kept
     dropped_out[_DROPPED_POINTS] = crowded
     dropped_out[_DROPPED_VOXELS] = wp.max(voxels - max_voxels, 0)
     dropped_out[_OUTSIDE] = outside
-
-
-@wp.kernel
-def _clear_in_order(
-    # in
-    filled_in: wp.array(dtype=wp.int32),
-    counts_in: wp.array(dtype=wp.int32),
-    per_voxel: int,
-    columns: int,
-    # out
-    features_out: wp.array(dtype=wp.float32),
-):
-    """One thread: zeroes the features that the launch before has set."""
-    for voxel in range(filled_in[0]):
-        base = voxel * per_voxel
-        for k in range(counts_in[voxel] * columns):
-            features_out[base + k] = 0.0
-
-
-@wp.kernel
-def _fill(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    extra_in: wp.array2d(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
-    place_in: wp.array(dtype=wp.int32),
-    voxel_count_in: wp.array(dtype=wp.int32),
-    # out
-    features_out: wp.array(dtype=wp.float32),
-    filled_out: wp.array(dtype=wp.int32),
-):
-    """Copies each point to its place."""
-    i = wp.tid()
-    if i == 0:
-        filled_out[0] = voxel_count_in[0]
-    if i >= count_in[0]:
-        return
-    place = place_in[i]
-    if place >= 0:
-        _write_features(xyz_in, extra_in, i, place, features_out)
 
 
 @wp.kernel
@@ -266,12 +253,10 @@ class Voxelize:
 
         keep("_grid", grid)
         keep("_sequential", sequential)
-        buffer("_features", size, wp.float32)
+        keep("_features", wp.zeros(size, dtype=wp.float32, device=device))
         keep("features", self._features.reshape((self.max_voxels, self.max_points, self.columns)))
         buffer("coords", (self.max_voxels, 3), wp.int32)
-        # As if a launch had filled every voxel, so that the first launch clears all of `features`.
-        keep("counts", wp.full(self.max_voxels, self.max_points, dtype=wp.int32, device=device))
-        keep("_filled", wp.full(1, self.max_voxels, dtype=wp.int32, device=device))
+        buffer("counts", self.max_voxels, wp.int32)
         keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("dropped", wp.zeros(3, dtype=wp.int32, device=device))
         if sequential:
@@ -282,7 +267,8 @@ class Voxelize:
             buffer("_slot_of_voxel", self.capacity, wp.int32)
             buffer("_cell_of_voxel", self.capacity, wp.int64)
             keep("_numbered", wp.zeros(1, dtype=wp.int32, device=device))
-            buffer("_place", self.capacity, wp.int32)
+            keep("_filled", wp.zeros(1, dtype=wp.int32, device=device))
+            keep("_room", [min(self.max_voxels, _LEAST_ROOM)])  # voxels that the function face expects
         else:
             keep("_sorted", VoxelSort(grid, self.capacity, device))
             keep("_outside", self.dropped[int(_OUTSIDE) :])
@@ -296,18 +282,10 @@ class Voxelize:
             extra: The columns after the third, float32, shape (n, columns - 3), or (n,) where it is one column.
         """
         extra = self._checked(xyz, extra)
-        if not self._sequential:
+        if self._sequential:
+            self._launch_in_order(xyz, count, extra, self._features, self._filled)
+        else:
             self._launch_sort(xyz, count, extra)
-            return
-        wp.launch(
-            _clear_in_order,
-            1,
-            inputs=[self._filled, self.counts, self.max_points * self.columns, self.columns],
-            outputs=[self._features],
-            device=self.device,
-        )
-        self._assign(xyz, count)
-        self._fill_into(self._features, xyz, count, extra)
 
     def _checked(self, xyz: wp.array, extra: wp.array | None) -> wp.array:
         """`extra` with two dimensions, after a look at the shapes."""
@@ -324,35 +302,37 @@ class Voxelize:
             raise ValueError(f"extra must have shape ({n}, {self.columns - 3}), not {extra.shape}")
         return extra
 
-    def _assign(self, xyz: wp.array, count: wp.array) -> None:
-        """In order: all outputs but the features, and each point's place among them."""
+    def _launch_in_order(
+        self, xyz: wp.array, count: wp.array, extra: wp.array, features: wp.array, filled: wp.array | None = None
+    ) -> None:
+        """Fills `features`, flat, as far as it reaches, and all other outputs."""
+        lines = None
+        if self.max_points * self.columns % int(_LINE) == 0:
+            lines = wp.array(ptr=features.ptr, dtype=_line, shape=features.shape[0] // int(_LINE), device=self.device)
         wp.launch(
-            _assign_in_order,
+            _voxelize_in_order,
             1,
-            inputs=[xyz, count, self._grid, self._dense, self.max_points, self.max_voxels],
+            inputs=[xyz, extra, count, self._grid, self._dense, self.max_points, self.max_voxels],
             outputs=[
-                self._table,
-                self._slot_of_voxel,
-                self._cell_of_voxel,
-                self._numbered,
-                self._place,
-                self.coords,
-                self.counts,
-                self.voxel_count,
-                self.dropped,
+                *(self._table, self._slot_of_voxel, self._cell_of_voxel, self._numbered, filled, features, lines),
+                *(self.coords, self.counts, self.voxel_count, self.dropped),
             ],
             device=self.device,
         )
 
-    def _fill_into(self, features: wp.array, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
-        """In order: copies the points to their places in `features`, flat and zero before."""
-        wp.launch(
-            _fill,
-            max(xyz.shape[0], 1),
-            inputs=[xyz, extra, count, self._place, self.voxel_count],
-            outputs=[features, self._filled],
-            device=self.device,
-        )
+    def _launch_into_new(self, xyz: wp.array, count: wp.array, extra: wp.array) -> np.ndarray:
+        """In order: as `launch`, but the features are an array of their own, since they are too many to copy."""
+        room = min(self._room[0], max(xyz.shape[0], 1))
+        while True:
+            host = np.empty((room, self.max_points, self.columns), np.float32)
+            self._launch_in_order(xyz, count, extra, wp.array(host.reshape(-1), copy=False, device=DEFAULT_DEVICE))
+            voxels = int(self.voxel_count.numpy()[0])
+            if voxels <= room:
+                break
+            room = voxels
+        # A cloud like this one shall find room enough at the first try.
+        self._room[0] = min(self.max_voxels, max(_LEAST_ROOM, voxels + voxels // 8))
+        return host[:voxels]
 
     def _launch_sort(self, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
         n = xyz.shape[0]
@@ -455,13 +435,8 @@ def voxelize(
         voxels = int(plan.voxel_count.numpy()[0])
         features = give(plan.features[:voxels], borrowed.family)
     else:
-        # The features go straight to an array of their own: they are too many to be worth a second copy.
-        extra = plan._checked(borrowed.xyz, borrowed.extra)
-        plan._assign(borrowed.xyz, count)
-        voxels = int(plan.voxel_count.numpy()[0])
-        host = np.zeros((voxels, plan.max_points, columns), np.float32)
-        if voxels:
-            plan._fill_into(wp.array(host.reshape(-1), copy=False, device="cpu"), borrowed.xyz, count, extra)
+        host = plan._launch_into_new(borrowed.xyz, count, plan._checked(borrowed.xyz, borrowed.extra))
+        voxels = len(host)
         features = adopt(host, borrowed.family)
     dropped_points, dropped_voxels, outside = (int(number) for number in plan.dropped.numpy())
     return Voxels(

@@ -96,7 +96,7 @@ def test_frames_limits_the_run(warploom, scans, tmp_path):
     ("arguments", "code", "message"),
     [
         (["run"], 2, "Missing option '--source'"),
-        (["run", "--source", "nowhere.bin"], 1, "nowhere.bin"),
+        (["run", "--source", "nowhere.bin"], 2, "nowhere.bin"),
         (["run", "--source", "bogus:thing"], 2, "unknown scheme"),
         (["run", "--source", "sim:street?seeed=1"], 2, "did you mean 'seed'"),
         (["run", "--source", "sim:street", "--profile", "nope"], 2, "no profile 'nope'"),
@@ -110,6 +110,11 @@ def test_frames_limits_the_run(warploom, scans, tmp_path):
 )
 def test_bad_usage_says_what_and_ends_with_its_code(warploom, arguments, code, message):
     assert message in " ".join(warploom(*arguments, expect=code).split())
+
+
+def test_a_recording_of_which_nothing_can_be_read_is_a_run_that_failed(warploom, tmp_path):
+    (tmp_path / "scan.bin").write_bytes(b"seven b")
+    assert "scan.bin" in warploom("run", "--source", "scan.bin", expect=1)
 
 
 def test_a_wrong_key_in_a_module_file_names_file_line_and_the_nearest_key(warploom, tmp_path):

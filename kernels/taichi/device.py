@@ -90,6 +90,14 @@ def _initialise(arch: str, threads: int | None) -> None:
         raise DeviceError(f"Taichi cannot compute on 'taichi:{arch}' here: {error}") from error
 
 
+@ti.kernel
+def _count_in_loops(counts: ti.types.ndarray(dtype=ti.i32, ndim=1)):
+    # 256 to each of four, for a look at the driver.
+    for block in range(16):
+        for i in range(block * 64, (block + 1) * 64):
+            ti.atomic_add(counts[i & 3], 1)
+
+
 def _run_taichi(arch: str, options: dict[str, int]) -> None:
     with contextlib.redirect_stdout(io.StringIO()):  # it greets
         ti.init(
@@ -104,6 +112,12 @@ def _run_taichi(arch: str, options: dict[str, int]) -> None:
         )
     # What only the thread that has started it can do; kernels may then be launched by any.
     impl.get_runtime().materialize()
+    if _arch_name() != "cpu":
+        counts = np.zeros(4, np.int32)
+        _count_in_loops(counts)
+        if counts.tolist() != [256] * 4:
+            ti.reset()
+            raise RuntimeError("its driver loses atomic additions in loops, as Mesa's lavapipe 22.3 does")
 
 
 def _arch_name() -> str:
