@@ -2,7 +2,8 @@
 
 First come, first served: voxels are numbered by the lowest index of a point in them, and keep their first points in
 the order of the input. A CPU does just that, in one pass over a dense grid, or a hash table where a grid would be too
-large. A GPU gets the same bytes from a stable sort by cell. Both clear only what the launch before has touched.
+large, and clears a voxel when it is met first, just before it is written. A GPU gets the same bytes from a stable sort
+by cell.
 """
 
 from __future__ import annotations
@@ -225,7 +226,7 @@ class Voxelize:
     counts: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (max_voxels,), int32, points kept in each voxel."""
     voxel_count: wp.array = field(init=False, repr=False, compare=False)
-    """Out: shape (1,), int32, how many voxels there are; rows from there on are old or zero."""
+    """Out: shape (1,), int32, how many voxels there are; from there on `features` are zero, and other rows old."""
     dropped: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (3,), int32: points beyond max_points, voxels beyond max_voxels, points outside or not finite."""
 
