@@ -55,7 +55,7 @@ def test_the_wheel_has_configuration_and_models_and_no_tests(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert any(name.startswith("warploom/conf/profiles/") for name in names)
     assert any(re.fullmatch(r"warploom/models/weights/.+\.onnx", name) for name in names)
-    assert not [name for name in names if "test" in pathlib.PurePath(name).name and name.endswith(".py")]
+    assert not [name for name in names if "/tests/" in name or pathlib.PurePath(name).name.startswith("test_")]
     assert all(name.startswith(("warploom/", "warploom-")) for name in names)
 
 
