@@ -39,6 +39,74 @@ class _Grid:
     columns: int
 
 
+@wp.func
+def _cell_of(p: wp.vec3, grid: _Grid) -> int:
+    """The cell of a point, or -1. Written so that NaN is outside."""
+    low = grid.low
+    high = grid.high
+    if not (
+        p[0] >= low[0] and p[0] < high[0] and p[1] >= low[1] and p[1] < high[1] and p[2] >= low[2] and p[2] < high[2]
+    ):
+        return -1
+    row = wp.min(int((p[0] - low[0]) * grid.cells_per_metre[0]), grid.rows - 1)
+    column = wp.min(int((p[1] - low[1]) * grid.cells_per_metre[1]), grid.columns - 1)
+    return row * grid.columns + column
+
+
+@wp.kernel
+def _draw_in_order(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    intensity_in: wp.array(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    density_in: wp.array(dtype=wp.float32),
+    # in out: the density map as integers, zero, for now one and the place among those seen of each cell
+    place: wp.array(dtype=wp.int32),
+    # out: of each cell seen its number, and its height, intensity and count
+    seen: wp.array(dtype=wp.int32),
+    values: wp.array(dtype=wp.vec3),
+    # in out: zero
+    maps: wp.array2d(dtype=wp.float32),
+):
+    """One thread: collects the cells that are seen side by side, and draws them in the end."""
+    cells_seen = int(0)
+    before = int(-1)
+    at = int(0)
+    value = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
+        p = xyz_in[i]
+        cell = _cell_of(p, grid)
+        if cell >= 0:
+            # Neighbours in a scan are mostly neighbours in space: often it is the cell of the point before.
+            if cell != before:
+                if before >= 0:
+                    values[at] = value
+                before = cell
+                at = place[cell] - 1
+                if at < 0:
+                    at = cells_seen
+                    cells_seen += 1
+                    place[cell] = cells_seen
+                    seen[at] = cell
+                    value = wp.vec3(-wp.inf, 0.0, 0.0)
+                else:
+                    value = values[at]
+            value[2] = value[2] + 1.0
+            if p[2] > value[0]:
+                value[0] = p[2]
+                if intensity_in:
+                    value[1] = intensity_in[i]
+    if before >= 0:
+        values[at] = value
+    for k in range(cells_seen):
+        cell = seen[k]
+        value = values[k]
+        maps[_HEIGHT, cell] = value[0]
+        maps[_INTENSITY, cell] = value[1]
+        maps[_DENSITY, cell] = density_in[int(wp.min(value[2], float(_FULL)))]
+
+
 @wp.kernel
 def _raise_cells(
     # in
@@ -55,17 +123,10 @@ def _raise_cells(
     if i >= count_in[0]:
         return
     p = xyz_in[i]
-    low = grid.low
-    high = grid.high
-    # Written so that NaN is outside.
-    if not (
-        p[0] >= low[0] and p[0] < high[0] and p[1] >= low[1] and p[1] < high[1] and p[2] >= low[2] and p[2] < high[2]
-    ):
-        cell_out[i] = -1
+    cell = _cell_of(p, grid)
+    cell_out[i] = cell
+    if cell < 0:
         return
-    row = wp.min(int((p[0] - low[0]) * grid.cells_per_metre[0]), grid.rows - 1)
-    column = wp.min(int((p[1] - low[1]) * grid.cells_per_metre[1]), grid.columns - 1)
-    cell = row * grid.columns + column
     # The bits of a float as an integer in the same order; adding zero makes −0 equal 0.
     bits = wp.cast(p[2] + 0.0, wp.int32)
     order = wp.int64(bits ^ ((bits >> 31) & 0x7FFFFFFF)) + _SIGN_BIAS
@@ -117,6 +178,8 @@ class BevMaps:
     """Rows, along x, and columns, along y."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
 
     maps: wp.array = field(init=False, repr=False)
     """Height [m], intensity and density per cell, shape (3, rows, columns), float32; zero where there is no point."""
@@ -136,7 +199,10 @@ class BevMaps:
         rows, columns = self.shape
         if rows * columns > 2**31 - 1:
             raise ValueError(f"shape {self.shape} has more cells than 2³¹ − 1")
+        if self.method not in ("auto", "in_order", "shared"):
+            raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
+        sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
         grid = _Grid()
         grid.low, grid.high = wp.vec3(*low), wp.vec3(*high)
         grid.cells_per_metre = wp.vec2(rows / (high[0] - low[0]), columns / (high[1] - low[1]))
@@ -146,10 +212,16 @@ class BevMaps:
             object.__setattr__(self, name, value)
 
         keep("_grid", grid)
-        keep("_cells", wp.zeros((rows * columns, 2), dtype=wp.int64, device=device))
+        keep("_sequential", sequential)
         density = np.log1p(np.arange(_FULL + 1)) / np.log(_FULL + 1)
         keep("_density", wp.array(density, dtype=wp.float32, device=device))
-        keep("_cell", wp.zeros(self.capacity, dtype=wp.int32, device=device))
+        if sequential:
+            most = min(self.capacity, rows * columns)
+            keep("_seen", wp.empty(most, dtype=wp.int32, device=device))
+            keep("_values", wp.empty(most, dtype=wp.vec3, device=device))
+        else:
+            keep("_cells", wp.zeros((rows * columns, 2), dtype=wp.int64, device=device))
+            keep("_cell", wp.zeros(self.capacity, dtype=wp.int32, device=device))
         keep("maps", wp.zeros((3, rows, columns), dtype=wp.float32, device=device))
         keep("_flat", self.maps.reshape((3, rows * columns)))
 
@@ -169,6 +241,17 @@ class BevMaps:
         n = xyz.shape[0]
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
+        if self._sequential:
+            cells = maps.shape[1]
+            place = wp.array(ptr=maps.ptr + 8 * cells, dtype=wp.int32, shape=cells, device=self.device)
+            wp.launch(
+                _draw_in_order,
+                1,
+                inputs=[xyz, intensity, count, self._grid, self._density],
+                outputs=[place, self._seen, self._values, maps],
+                device=self.device,
+            )
+            return
         wp.launch(
             _raise_cells,
             n,

@@ -91,9 +91,10 @@ def test_arrays_of_other_families():
     assert np.array_equal(bev(wp.array(points, dtype=wp.float32, device="cpu"), RANGE, (50, 50)).numpy(), expected)
 
 
-def test_the_plan_reads_its_count_and_leaves_nothing_behind(device):
-    first, second = cloud(4000, 1), cloud(3000, 2)
-    plan = BevMaps(capacity=4096, point_range=RANGE, shape=(64, 48), device=device)
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_the_plan_reads_its_count_and_leaves_nothing_behind(device, method):
+    first, second = cloud(4000, 1, step=0.5), cloud(3000, 2)
+    plan = BevMaps(capacity=4096, point_range=RANGE, shape=(64, 48), device=device, method=method)
     for points, n in ((first, 4000), (second, 1000), (first, 2500)):
         plan.launch(
             wp.array(points[:, :3].copy(), dtype=wp.vec3, device=device),
@@ -103,6 +104,51 @@ def test_the_plan_reads_its_count_and_leaves_nothing_behind(device):
         expected = reference(points[:n], RANGE, (64, 48))
         assert np.array_equal(plan.maps.numpy()[:2], expected[:2])
         np.testing.assert_allclose(plan.maps.numpy()[2], expected[2], atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(width=32)] * 4), max_size=40))
+def test_both_methods_draw_any_floats_alike(rows):
+    """NaN, infinities and denormals; maps are compared as bytes."""
+    points = np.array(rows, np.float32).reshape(-1, 4)
+    drawn = []
+    for method in ("in_order", "shared"):
+        plan = BevMaps(capacity=64, point_range=RANGE, shape=(8, 8), method=method)
+        count = wp.array([len(points)], dtype=wp.int32, device="cpu")
+        xyz = wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu")
+        plan.launch(xyz, wp.array(points[:, 3].copy(), dtype=wp.float32, device="cpu"), count)
+        drawn.append(plan.maps.numpy().tobytes())
+    assert drawn[0] == drawn[1] == bev(points, RANGE, (8, 8)).tobytes()
+
+
+def test_strided_read_only_and_float64_input_gives_the_same():
+    points = np.random.default_rng(5).normal(0, [20, 20, 1.5, 1, 1, 1], (900, 6)).astype(np.float32)
+    expected = bev(points[:, :4].copy(), RANGE, (30, 20))
+    strided = points[:, :5]
+    strided.flags.writeable = False
+    assert np.array_equal(bev(strided, RANGE, (30, 20)), expected)
+    assert np.array_equal(bev(points.astype(np.float64), RANGE, (30, 20)), expected)
+
+
+@pytest.mark.parametrize("method", ["in_order", "shared"])
+def test_a_captured_launch_replays_on_other_points(device, method):
+    plan = BevMaps(capacity=500, point_range=RANGE, shape=(20, 30), device=device, method=method)
+    xyz = wp.array(cloud(500, 1)[:, :3].copy(), dtype=wp.vec3, device=device)
+    intensity = wp.array(cloud(500, 1)[:, 3].copy(), dtype=wp.float32, device=device)
+    count = wp.array([500], dtype=wp.int32, device=device)
+    plan.launch(xyz, intensity, count)
+    with wp.ScopedCapture(device=device) as capture:
+        plan.launch(xyz, intensity, count)
+    points = cloud(500, 2)
+    xyz.assign(points[:, :3].copy())
+    intensity.assign(points[:, 3].copy())
+    wp.capture_launch(capture.graph)
+    assert np.array_equal(plan.maps.numpy()[:2], reference(points, RANGE, (20, 30))[:2])
+
+
+def test_an_unknown_method_is_refused():
+    with pytest.raises(ValueError, match="method must be 'auto', 'in_order' or 'shared', not 'fast'"):
+        BevMaps(capacity=1, point_range=RANGE, shape=(1, 1), method="fast")
 
 
 @pytest.mark.parametrize(
