@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.motion import MotionCompensation, compensate_motion
     from .kernels.range_image import RangeImage, RangeProjection, range_image
+    from .kernels.registration import Registration, ScanRegistration, register
     from .kernels.roi import PolygonMask, in_polygons
     from .kernels.voxel import Voxelize, Voxels, voxelize
+    from .kernels.voxel_map import VoxelMap
     from .models.head import DetectionHead
     from .models.tracker import Tracker, TrackerConfig, Tracks
 
@@ -56,8 +58,10 @@ _HOMES = {
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.motion": ("MotionCompensation", "compensate_motion"),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
+    "kernels.registration": ("Registration", "ScanRegistration", "register"),
     "kernels.roi": ("PolygonMask", "in_polygons"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
+    "kernels.voxel_map": ("VoxelMap",),
     "models.head": ("DetectionHead",),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
 }
@@ -87,11 +91,14 @@ __all__ = [
     "PolygonMask",
     "RangeImage",
     "RangeProjection",
+    "Registration",
+    "ScanRegistration",
     "SourceError",
     "Tracker",
     "TrackerConfig",
     "Tracks",
     "VoxelDownsample",
+    "VoxelMap",
     "Voxelize",
     "Voxels",
     "WarploomError",
@@ -109,6 +116,7 @@ __all__ = [
     "open_source",
     "range_image",
     "read",
+    "register",
     "rotated_iou_bev",
     "segment_ground",
     "voxel_downsample",

@@ -2,9 +2,9 @@
 
 Point-to-point ICP in KISS-ICP's form (Vizzo et al., 2023): the nearest point of the map for each point, a robust kernel
 (Geman and McClure), and one Gauss–Newton step on SE(3), again and again until the step is small. The kernel begins wide
-and narrows as steps get smaller, so that neither a wrong guess nor what does not belong spoils the result. Sums run in blocks of
-fixed order, so the result is the same on every run. Most points need no new search: one whose nearest was nearer than
-any other by more than twice its way since then still has the same.
+and narrows as steps get smaller, so that neither a wrong guess nor what does not belong spoils the result, and steps
+that go on the same way are lengthened. Sums run in blocks of fixed order, so the result is the same on every run. Most
+points need no new search: one whose nearest was nearer than any other by more than twice its way since still has it.
 """
 
 from __future__ import annotations
@@ -19,168 +19,20 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
 from .downsample import VoxelDownsample
+from .gauss_newton import COUNT, SQUARES, Step, Sums, narrowed, solve, stepped, stretch_of, terms_of
 from .interop import borrow_points, count_on
 from .plan import capacity_for, plan_for
-from .voxel_map import VoxelMap, moved_by, nearest_in_map
+from .voxel_map import VoxelMap
+from .voxel_table import moved_by, nearest_in_map
 
 __all__ = ["Registration", "ScanRegistration", "register"]
 
 # Sums must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-# What is summed over all points, w being a point's weight, r its residual, a its arm from the sensor:
-# w, w a (3), w a aᵀ (xx xy xz yy yz zz), w r (3), w a × r (3), r², and how many there are.
-_W, _A, _AA, _R, _AR, _RR, _N = (wp.constant(i) for i in (0, 1, 4, 10, 13, 16, 17))
-_Sums = wp.types.vector(length=18, dtype=wp.float64)
-_Step = wp.types.vector(length=6, dtype=wp.float64)
-_System = wp.types.matrix(shape=(6, 6), dtype=wp.float64)
 _BLOCK = wp.constant(32)
 _ROUNDING = wp.constant(wp.float32(1.0e-4))  # [m], by which distances in float32 may be off at most
-_SMALL_STEP = wp.constant(wp.float32(0.01))  # beside the kernel's scale
-_LONGEST = wp.constant(wp.float64(4.0))  # as many times a step may be lengthened
 _NEVER = wp.constant(wp.float32(-1.0))
-
-
-@wp.func
-def _terms(w: wp.float64, r: wp.vec3d, a: wp.vec3d) -> _Sums:
-    """What one point adds to the sums; nothing for weight 0."""
-    s = _Sums()
-    if w > wp.float64(0.0):
-        s[0] = w
-        s[1] = w * a[0]
-        s[2] = w * a[1]
-        s[3] = w * a[2]
-        s[4] = w * a[0] * a[0]
-        s[5] = w * a[0] * a[1]
-        s[6] = w * a[0] * a[2]
-        s[7] = w * a[1] * a[1]
-        s[8] = w * a[1] * a[2]
-        s[9] = w * a[2] * a[2]
-        s[10] = w * r[0]
-        s[11] = w * r[1]
-        s[12] = w * r[2]
-        s[13] = w * (a[1] * r[2] - a[2] * r[1])
-        s[14] = w * (a[2] * r[0] - a[0] * r[2])
-        s[15] = w * (a[0] * r[1] - a[1] * r[0])
-        s[16] = wp.length_sq(r)
-        s[17] = wp.float64(1.0)
-    return s
-
-
-@wp.func
-def _solve(s: _Sums) -> _Step:
-    """The Gauss–Newton step: translation, then rotation vector about the sensor; by Cholesky's decomposition."""
-    zero = wp.float64(0.0)
-    h = _System()
-    for k in range(3):
-        h[k, k] = s[_W]
-    # The upper right block is -w [a]×.
-    h[0, 4] = s[_A + 2]
-    h[0, 5] = -s[_A + 1]
-    h[1, 3] = -s[_A + 2]
-    h[1, 5] = s[_A]
-    h[2, 3] = s[_A + 1]
-    h[2, 4] = -s[_A]
-    h[3, 3] = s[_AA + 3] + s[_AA + 5]
-    h[4, 4] = s[_AA] + s[_AA + 5]
-    h[5, 5] = s[_AA] + s[_AA + 3]
-    h[3, 4] = -s[_AA + 1]
-    h[3, 5] = -s[_AA + 2]
-    h[4, 5] = -s[_AA + 4]
-    # What the points say nothing about, such as a turn about the line that all lie on, is left as it is.
-    tiny = wp.float64(1.0e-9)
-    inertia = (h[3, 3] + h[4, 4] + h[5, 5]) * tiny + s[_W] * tiny
-    for k in range(3):
-        h[k, k] = h[k, k] + s[_W] * tiny
-        h[k + 3, k + 3] = h[k + 3, k + 3] + inertia
-    x = _Step()
-    for k in range(3):
-        x[k] = -s[_R + k]
-        x[k + 3] = -s[_AR + k]
-    # h = uᵀ u, u upper triangular in place of h.
-    for i in range(6):
-        for k in range(i):
-            h[i, i] = h[i, i] - h[k, i] * h[k, i]
-        if h[i, i] <= zero:
-            return _Step()
-        h[i, i] = wp.sqrt(h[i, i])
-        for j in range(i + 1, 6):
-            for k in range(i):
-                h[i, j] = h[i, j] - h[k, i] * h[k, j]
-            h[i, j] = h[i, j] / h[i, i]
-    for i in range(6):
-        for k in range(i):
-            x[i] = x[i] - h[k, i] * x[k]
-        x[i] = x[i] / h[i, i]
-    for back in range(6):
-        i = 5 - back
-        for k in range(i + 1, 6):
-            x[i] = x[i] - h[i, k] * x[k]
-        x[i] = x[i] / h[i, i]
-    return x
-
-
-@wp.func
-def _stepped(pose: wp.mat44d, x: _Step) -> wp.mat44d:
-    """The pose moved by a step and turned about its own place, its rotation kept a rotation."""
-    one = wp.float64(1.0)
-    half = wp.float64(0.5)
-    turn = wp.vec3d(x[3], x[4], x[5])
-    angle = wp.length(turn)
-    # Rodrigues' formula.
-    sine = one - angle * angle / wp.float64(6.0)
-    cosine = half - angle * angle / wp.float64(24.0)
-    if angle > wp.float64(1.0e-4):
-        sine = wp.sin(angle) / angle
-        cosine = (one - wp.cos(angle)) / (angle * angle)
-    cross = wp.skew(turn)
-    exponential = wp.identity(n=3, dtype=wp.float64) + sine * cross + cosine * (cross * cross)
-    rotation = wp.mat33d(
-        pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2]
-    )
-    rotation = exponential * rotation
-    # One step of Newton's to the nearest rotation.
-    rotation = wp.float64(1.5) * rotation - half * (rotation * wp.transpose(rotation) * rotation)
-    moved = wp.mat44d(pose)
-    for i in range(3):
-        for j in range(3):
-            moved[i, j] = rotation[i, j]
-        moved[i, 3] = pose[i, 3] + x[i]
-    return moved
-
-
-@wp.func
-def _narrowed(scale: float, final_scale: float, x: _Step) -> float:
-    """The kernel's scale after a step: half of it once steps are small beside it, but not below the final one."""
-    following = float(scale)
-    if float(wp.length_sq(x)) < _SMALL_STEP * _SMALL_STEP * scale * scale:
-        following = wp.max(0.5 * scale, final_scale)
-    return following
-
-
-@wp.func
-def _stretch(s: _Sums, x: _Step, last: _Step, last_stretch: wp.float64) -> wp.float64:
-    """By how much to lengthen a step, from how it compares with the last (Barzilai and Borwein, 1988).
-
-    ICP's steps shrink by a near constant share, as each finds but a part of the way: a longer one saves many. Turns
-    count by how far they move the points.
-    """
-    one = wp.float64(1.0)
-    arm_sq = wp.float64(0.0)
-    if s[_W] > wp.float64(0.0):
-        arm_sq = (s[_AA] + s[_AA + 3] + s[_AA + 5]) / s[_W]
-    along = wp.float64(0.0)
-    before = wp.float64(0.0)
-    for k in range(3):
-        along += x[k] * last[k] + arm_sq * x[k + 3] * last[k + 3]
-        before += last[k] * last[k] + arm_sq * last[k + 3] * last[k + 3]
-    stretch = one
-    # Only where it goes on the same way, and by less.
-    if along > wp.float64(0.0):
-        stretch = _LONGEST
-        if along * _LONGEST < before * (_LONGEST - last_stretch):
-            stretch = wp.max(last_stretch * before / (before - along), one)
-    return stretch
 
 
 @wp.func
@@ -254,35 +106,35 @@ def _register_in_order(
     pose = guess_in[0]
     for i in range(n):
         margin[i] = _NEVER
-    sums = _Sums()
+    sums = Sums()
     scale = wp.max(limits_in[1], limits_in[2])
-    last = _Step()
+    last = Step()
     stretch = wp.float64(1.0)
     iterations = int(0)
     converged = int(0)
     while iterations < max_iterations and converged == 0:
-        sums = _Sums()
+        sums = Sums()
         first = int(0)
         while first < n:
-            block = _Sums()
+            block = Sums()
             for i in range(first, wp.min(first + _BLOCK, n)):
                 weight, r, arm = _match(
                     i, xyz_in, pose, limits_in[0], scale, table, points, max_points, size, target, searched_at, margin,
                 )  # fmt: skip
-                block += _terms(weight, r, arm)
+                block += terms_of(weight, r, arm)
             sums += block
             first += _BLOCK
-        x = _solve(sums)
-        stretch = _stretch(sums, x, last, stretch)
-        pose = _stepped(pose, stretch * x)
+        x = solve(sums)
+        stretch = stretch_of(sums, x, last, stretch)
+        pose = stepped(pose, stretch * x)
         last = x
         iterations += 1
         if scale <= limits_in[2] and wp.length_sq(x) < tolerance * tolerance:
             converged = 1
-        scale = _narrowed(scale, limits_in[2], x)
+        scale = narrowed(scale, limits_in[2], x)
     pose_out[0] = pose
-    fit_out[0] = float(sums[_N])
-    fit_out[1] = float(sums[_RR])
+    fit_out[0] = float(sums[COUNT])
+    fit_out[1] = float(sums[SQUARES])
     iterations_out[0] = iterations
     converged_out[0] = converged
 
@@ -295,6 +147,7 @@ def _begin(
     # out
     margin_out: wp.array(dtype=wp.float32),
     scale_out: wp.array(dtype=wp.float32),
+    last_out: wp.array(dtype=wp.float64),
     pose_out: wp.array(dtype=wp.mat44d),
     iterations_out: wp.array(dtype=wp.int32),
     converged_out: wp.array(dtype=wp.int32),
@@ -304,6 +157,9 @@ def _begin(
     if i == 0:
         pose_out[0] = guess_in[0]
         scale_out[0] = wp.max(limits_in[1], limits_in[2])
+        for k in range(6):
+            last_out[k] = wp.float64(0.0)
+        last_out[6] = wp.float64(1.0)
         iterations_out[0] = 0
         converged_out[0] = 0
 
@@ -358,12 +214,12 @@ def _sum_blocks(
     partial_out: wp.array2d(dtype=wp.float64),
 ):
     """One term of one block a thread."""
-    block, term = wp.tid()
+    block, term = wp.tid()  # pyright: ignore[reportAssignmentType]
     if converged_in[0] == 1:
         return
     total = wp.float64(0.0)
     for i in range(block * _BLOCK, wp.min((block + 1) * _BLOCK, weight_in.shape[0])):
-        terms = _terms(weight_in[i], residual_in[i], arm_in[i])
+        terms = terms_of(weight_in[i], residual_in[i], arm_in[i])
         total += terms[term]
     partial_out[block, term] = total
 
@@ -393,8 +249,9 @@ def _step(
     sums_in: wp.array(dtype=wp.float64),
     limits_in: wp.array(dtype=wp.float32),
     tolerance: wp.float64,
-    # in out
+    # in out: the kernel's scale; the last step, and by how much it was lengthened
     scale: wp.array(dtype=wp.float32),
+    last: wp.array(dtype=wp.float64),
     pose: wp.array(dtype=wp.mat44d),
     iterations: wp.array(dtype=wp.int32),
     converged: wp.array(dtype=wp.int32),
@@ -404,17 +261,23 @@ def _step(
     """One thread: the step, unless the last was small enough."""
     if converged[0] == 1:
         return
-    sums = _Sums()
+    sums = Sums()
     for term in range(18):
         sums[term] = sums_in[term]
-    x = _solve(sums)
-    pose[0] = _stepped(pose[0], x)
+    x = solve(sums)
+    before = Step()
+    for k in range(6):
+        before[k] = last[k]
+        last[k] = x[k]
+    stretch = stretch_of(sums, x, before, last[6])
+    last[6] = stretch
+    pose[0] = stepped(pose[0], stretch * x)
     iterations[0] = iterations[0] + 1
     if scale[0] <= limits_in[2] and wp.length_sq(x) < tolerance * tolerance:
         converged[0] = 1
-    scale[0] = _narrowed(scale[0], limits_in[2], x)
-    fit_out[0] = float(sums[_N])
-    fit_out[1] = float(sums[_RR])
+    scale[0] = narrowed(scale[0], limits_in[2], x)
+    fit_out[0] = float(sums[COUNT])
+    fit_out[1] = float(sums[SQUARES])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -473,6 +336,7 @@ class ScanRegistration:
             buffer("_partial", (-(-self.capacity // int(_BLOCK)), 18), wp.float64)
             buffer("_sums", 18, wp.float64)
             buffer("_scale", 1, wp.float32)
+            buffer("_last", 7, wp.float64)
 
     def launch(self, xyz: wp.array, count: wp.array, voxel_map: VoxelMap, guess: wp.array, limits: wp.array) -> None:
         """Fills the outputs; allocates nothing, reads nothing back.
@@ -502,7 +366,7 @@ class ScanRegistration:
         blocks = -(-n // int(_BLOCK))
         terms = [self._weight[:n], self._residual[:n], self._arm[:n]]
         self.fit.zero_()
-        self._run(_begin, max(n, 1), [guess, limits], [self._margin, self._scale, *state])
+        self._run(_begin, max(n, 1), [guess, limits], [self._margin, self._scale, self._last, *state])
         for _ in range(self.max_iterations):
             self._run(
                 _match_all,
@@ -512,7 +376,7 @@ class ScanRegistration:
             )
             self._run(_sum_blocks, (blocks, 18), [self.converged, *terms], [self._partial])
             self._run(_sum_all, 18, [self.converged, self._partial, blocks], [self._sums])
-            self._run(_step, 1, [self._sums, limits, self.tolerance], [self._scale, *state, self.fit])
+            self._run(_step, 1, [self._sums, limits, self.tolerance], [self._scale, self._last, *state, self.fit])
 
     def _run(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.pose.device)
@@ -552,8 +416,8 @@ def register(
 ) -> Registration:
     """Finds the rigid motion that lays a cloud onto another (KISS-ICP's registration: Vizzo et al., 2023).
 
-    The target becomes a map of voxels of up to 20 points each, a voxel's fraction apart; the source is thinned out to
-    a centroid a voxel of that spacing's fifth root. Points that are not finite are left out.
+    The target becomes a map with up to 20 points a voxel, and the source is thinned out to a centroid for each half
+    voxel. The robust kernel begins half as wide as `max_distance`. Points that are not finite are left out.
 
     Args:
         source: Positions [m], shape (n, 3 or more), floating; NumPy, torch, Warp or DLPack.
@@ -561,7 +425,7 @@ def register(
         initial: Target from source to begin with, shape (4, 4); by default the identity.
         voxel_size: Edge of a voxel of the map [m]: nearest points are found up to about this distance.
         max_distance: Points farther apart do not count [m].
-        robust_scale: The scale c of the kernel [m], which weighs points a distance d apart by (c² / (c² + d²))².
+        robust_scale: The final scale c of the kernel [m], which weighs points a distance d apart by (c² / (c² + d²))².
         max_iterations: Steps at most.
         tolerance: A step below is the last, its translation [m] and rotation vector [rad] together.
 

@@ -1,8 +1,7 @@
 """A map of points in voxels, as scan registration wants it: points are added, voxels far away go, nearest are found.
 
 Voxels are found by a hash table; each holds up to so many points, none closer to another of its voxel than a spacing
-(KISS-ICP: Vizzo et al., 2023). Points are kept against the corner of their voxel, so that a map is as exact a thousand
-kilometres from where it began as at its origin. Points of a voxel come in the order of the input, whatever the device.
+(KISS-ICP: Vizzo et al., 2023). Points of a voxel come in the order of the input, whatever the device.
 """
 
 from __future__ import annotations
@@ -15,205 +14,28 @@ import numpy as np
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
+from .voxel_table import (
+    FREE,
+    add_point,
+    cell_of,
+    cell_of_key,
+    content_of,
+    find_slot,
+    first_slot,
+    is_usable,
+    key_of,
+    moved_by,
+    offset_in,
+)
 
-__all__ = ["VoxelMap", "moved_by", "nearest_in_map"]
+__all__ = ["VoxelMap"]
 
 # Which voxel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_FREE = wp.constant(wp.int64(-1))
 _LAST_KEY = wp.constant(wp.int64(2**63 - 1))
-_CELL_LIMIT = wp.constant(wp.float64(2.0**20))
-_CELL_BIAS = wp.constant(wp.int64(2**20))
-_SPREAD = wp.constant(wp.uint32(0x9E3779B1))
 _MOST_POINTS = 255
 _DROPPED_POINTS, _DROPPED_VOXELS = (wp.constant(i) for i in range(2))
-
-
-@wp.func
-def moved_by(pose: wp.mat44d, p: wp.vec3) -> wp.vec3d:
-    """A point seen from a pose, in the world."""
-    x = wp.float64(p[0])
-    y = wp.float64(p[1])
-    z = wp.float64(p[2])
-    return wp.vec3d(
-        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
-        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
-        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
-    )
-
-
-@wp.func
-def _is_usable(p: wp.vec3d, inverse_size: wp.float64) -> bool:
-    """Whether a point lies in a voxel that has a number; false for what is not finite."""
-    total = (wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2])) * inverse_size
-    return total < _CELL_LIMIT
-
-
-@wp.func
-def _cell_of(p: wp.vec3d, inverse_size: wp.float64) -> wp.vec3i:
-    return wp.vec3i(
-        int(wp.floor(p[0] * inverse_size)), int(wp.floor(p[1] * inverse_size)), int(wp.floor(p[2] * inverse_size))
-    )
-
-
-@wp.func
-def _offset_in(p: wp.vec3d, cell: wp.vec3i, size: wp.float64) -> wp.vec3:
-    """A point against the low corner of its cell."""
-    return wp.vec3(
-        float(p[0] - wp.float64(cell[0]) * size),
-        float(p[1] - wp.float64(cell[1]) * size),
-        float(p[2] - wp.float64(cell[2]) * size),
-    )
-
-
-@wp.func
-def _key_of(cell: wp.vec3i) -> wp.int64:
-    x = wp.int64(cell[0]) + _CELL_BIAS
-    y = wp.int64(cell[1]) + _CELL_BIAS
-    z = wp.int64(cell[2]) + _CELL_BIAS
-    return (x << wp.int64(42)) | (y << wp.int64(21)) | z
-
-
-@wp.func
-def _cell_of_key(key: wp.int64) -> wp.vec3i:
-    low = (_CELL_BIAS << wp.int64(1)) - wp.int64(1)
-    return wp.vec3i(
-        int((key >> wp.int64(42)) - _CELL_BIAS),
-        int(((key >> wp.int64(21)) & low) - _CELL_BIAS),
-        int((key & low) - _CELL_BIAS),
-    )
-
-
-@wp.func
-def _slot_of(cell: wp.vec3i, mask: int) -> int:
-    """Where a cell is looked for first; the 64 cells of a cube of 4 lie together."""
-    mixed = (
-        wp.uint32(cell[0] >> 2) * wp.uint32(73856093)
-        ^ wp.uint32(cell[1] >> 2) * wp.uint32(19349669)
-        ^ wp.uint32(cell[2] >> 2) * wp.uint32(83492791)
-    )
-    block = int((mixed * _SPREAD) >> wp.uint32(7))
-    return ((block << 6) | ((cell[2] & 3) << 4) | ((cell[1] & 3) << 2) | (cell[0] & 3)) & mask
-
-
-@wp.func
-def _find(table: wp.array2d(dtype=wp.int64), cell: wp.vec3i) -> int:
-    """The slot of a cell, or the free one where it would be put."""
-    mask = table.shape[0] - 1
-    key = _key_of(cell)
-    slot = _slot_of(cell, mask)
-    found = table[slot, 0]
-    while found != key and found != _FREE:
-        slot = (slot + 64) & mask
-        found = table[slot, 0]
-    return slot
-
-
-@wp.func
-def _lookup(table: wp.array2d(dtype=wp.int64), cell: wp.vec3i) -> wp.int64:
-    """The voxel of a cell and its points, as voxel << 8 | points; 0 points where there is none."""
-    slot = _find(table, cell)
-    content = wp.int64(0)
-    if table[slot, 0] != _FREE:
-        content = table[slot, 1]
-    return content
-
-
-@wp.func
-def _add(
-    points: wp.array(dtype=wp.vec3), voxel: int, count: int, max_points: int, offset: wp.vec3, spacing_sq: float
-) -> int:
-    """Adds a point to its voxel unless that is full or the point too close to another; how many it then has."""
-    if count >= max_points:
-        return count
-    base = voxel * max_points
-    for k in range(count):
-        if wp.length_sq(points[base + k] - offset) < spacing_sq:
-            return count
-    points[base + count] = offset
-    return count + 1
-
-
-@wp.func
-def _gap(which: int, near: float, edge: float) -> float:
-    """The square of how far along an axis the own voxel is (0), the nearer neighbour (1), the other (2)."""
-    gap = wp.where(which == 1, near, wp.where(which == 2, edge - near, 0.0))
-    return gap * gap
-
-
-@wp.func
-def _side(which: int, nearer: int) -> int:
-    """The cell, against the own, that is meant by the same number."""
-    return wp.where(which == 2, -nearer, which * nearer)
-
-
-@wp.func
-def nearest_in_map(
-    table: wp.array2d(dtype=wp.int64),
-    points: wp.array(dtype=wp.vec3),
-    max_points: int,
-    p: wp.vec3d,
-    size: wp.float64,
-    limit_sq: float,
-) -> tuple[wp.vec3, float, float]:
-    """The point of the map nearest to `p`, among the 27 voxels around it.
-
-    Returns:
-        From `p` to it; its squared distance, `limit_sq` where none is nearer than that; and a lower bound of the
-        squared distance of every other point of the map.
-    """
-    best = limit_sq
-    vector = wp.vec3()
-    inverse_size = wp.float64(1.0) / size
-    if not _is_usable(p, inverse_size):
-        return vector, best, 0.0
-    cell = _cell_of(p, inverse_size)
-    offset = _offset_in(p, cell, size)
-    edge = float(size)
-    # The nearer neighbour along each axis comes first, and voxels beyond the best so far are left out.
-    near = wp.vec3()
-    side = wp.vec3i()
-    for axis in range(3):
-        near[axis] = wp.max(wp.min(offset[axis], edge - offset[axis]), 0.0)
-        side[axis] = wp.where(offset[axis] < edge - offset[axis], -1, 1)
-    border = edge + wp.min(near[0], wp.min(near[1], near[2]))
-    other = border * border
-    z = int(0)
-    while z < 3:
-        beyond_z = _gap(z, near[2], edge)
-        if beyond_z < best:
-            y = int(0)
-            while y < 3:
-                beyond_y = beyond_z + _gap(y, near[1], edge)
-                if beyond_y < best:
-                    x = int(0)
-                    while x < 3:
-                        beyond = beyond_y + _gap(x, near[0], edge)
-                        if beyond < best:
-                            shift = wp.vec3i(_side(x, side[0]), _side(y, side[1]), _side(z, side[2]))
-                            content = _lookup(table, cell + shift)
-                            base = int(content >> wp.int64(8)) * max_points
-                            corner = wp.vec3(float(shift[0]), float(shift[1]), float(shift[2])) * edge - offset
-                            found = int(-1)
-                            for k in range(base, base + int(content & wp.int64(255))):
-                                distance_sq = wp.length_sq(corner + points[k])
-                                other = wp.min(other, wp.max(distance_sq, best))
-                                if distance_sq < best:
-                                    best = distance_sq
-                                    found = k
-                            if found >= 0:
-                                vector = corner + points[found]
-                        else:
-                            other = wp.min(other, beyond)
-                        x += 1
-                else:
-                    other = wp.min(other, beyond_y)
-                y += 1
-        else:
-            other = wp.min(other, beyond_z)
-        z += 1
-    return vector, best, other
 
 
 @wp.kernel
@@ -240,26 +62,26 @@ def _insert_in_order(
     left = free_count[0]
     for i in range(wp.min(count_in[0], xyz_in.shape[0])):
         p = moved_by(pose, xyz_in[i])
-        if _is_usable(p, inverse_size):
-            cell = _cell_of(p, inverse_size)
-            slot = _find(table, cell)
+        if is_usable(p, inverse_size):
+            cell = cell_of(p, inverse_size)
+            slot = find_slot(table, cell)
             voxel = int(-1)
             count = int(0)
-            if table[slot, 0] != _FREE:
+            if table[slot, 0] != FREE:
                 content = table[slot, 1]
                 voxel = int(content >> wp.int64(8))
                 count = int(content & wp.int64(255))
             elif left > 0:
                 left -= 1
                 voxel = free[left]
-                table[slot, 0] = _key_of(cell)
-                key_of_voxel[voxel] = _key_of(cell)
+                table[slot, 0] = key_of(cell)
+                key_of_voxel[voxel] = key_of(cell)
             if voxel < 0:
                 dropped[_DROPPED_VOXELS] = dropped[_DROPPED_VOXELS] + 1
             else:
-                now = _add(points, voxel, count, max_points, _offset_in(p, cell, size), spacing_sq)
+                now = add_point(points, voxel, count, max_points, offset_in(p, cell, size), spacing_sq)
                 if now != count:
-                    table[slot, 1] = (wp.int64(voxel) << wp.int64(8)) | wp.int64(now)
+                    table[slot, 1] = content_of(voxel, now)
                     points_in_voxel[voxel] = now
         else:
             dropped[_DROPPED_POINTS] = dropped[_DROPPED_POINTS] + 1
@@ -286,8 +108,8 @@ def _sort_keys(
     if i < count_in[0]:
         inverse_size = wp.float64(1.0) / size
         p = moved_by(pose_in[0], xyz_in[i])
-        if _is_usable(p, inverse_size):
-            key = _key_of(_cell_of(p, inverse_size))
+        if is_usable(p, inverse_size):
+            key = key_of(cell_of(p, inverse_size))
         else:
             wp.atomic_add(dropped, _DROPPED_POINTS, 1)
     key_out[i] = key
@@ -313,9 +135,9 @@ def _mark_new(
         return
     if j > 0 and key_in[wp.max(j - 1, 0)] == key:
         return
-    slot = _find(table, _cell_of_key(key))
+    slot = find_slot(table, cell_of_key(key))
     slot_out[j] = slot
-    if table[slot, 0] == _FREE:
+    if table[slot, 0] == FREE:
         new_out[point_in[j]] = 1
 
 
@@ -348,7 +170,7 @@ def _insert_segments(
         return
     n = key_in.shape[0]
     key = key_in[j]
-    cell = _cell_of_key(key)
+    cell = cell_of_key(key)
     voxel = int(-1)
     count = int(0)
     if new_in[point_in[j]] == 1:
@@ -356,10 +178,10 @@ def _insert_segments(
         if place >= 0:
             voxel = free_in[place]
             key_of_voxel[voxel] = key
-            found = wp.atomic_cas(table, slot, 0, _FREE, key)
-            while found != _FREE:
+            found = wp.atomic_cas(table, slot, 0, FREE, key)
+            while found != FREE:
                 slot = (slot + 64) & (table.shape[0] - 1)
-                found = wp.atomic_cas(table, slot, 0, _FREE, key)
+                found = wp.atomic_cas(table, slot, 0, FREE, key)
     else:
         content = table[slot, 1]
         voxel = int(content >> wp.int64(8))
@@ -369,11 +191,11 @@ def _insert_segments(
         if voxel < 0:
             wp.atomic_add(dropped, _DROPPED_VOXELS, 1)
         else:
-            offset = _offset_in(moved_by(pose_in[0], xyz_in[point_in[k]]), cell, size)
-            count = _add(points, voxel, count, max_points, offset, spacing_sq)
+            offset = offset_in(moved_by(pose_in[0], xyz_in[point_in[k]]), cell, size)
+            count = add_point(points, voxel, count, max_points, offset, spacing_sq)
         k += 1
     if voxel >= 0:
-        table[slot, 1] = (wp.int64(voxel) << wp.int64(8)) | wp.int64(count)
+        table[slot, 1] = content_of(voxel, count)
         points_in_voxel[voxel] = count
 
 
@@ -389,7 +211,7 @@ def _take_free(
 
 @wp.func
 def _is_far(key: wp.int64, at: wp.vec3d, size: wp.float64, reach: wp.float64) -> bool:
-    cell = _cell_of_key(key)
+    cell = cell_of_key(key)
     half = wp.float64(0.5)
     centre = wp.vec3d(
         (wp.float64(cell[0]) + half) * size, (wp.float64(cell[1]) + half) * size, (wp.float64(cell[2]) + half) * size
@@ -424,20 +246,20 @@ def _prune_in_order(
     at = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
     pruned_at[0] = at
     for slot in range(table.shape[0]):
-        table[slot, 0] = _FREE
+        table[slot, 0] = FREE
     left = int(0)
     for voxel in range(key_of_voxel.shape[0]):
         key = key_of_voxel[voxel]
-        if key != _FREE and _is_far(key, at, size, reach):
-            key = _FREE
-            key_of_voxel[voxel] = _FREE
-        if key == _FREE:
+        if key != FREE and _is_far(key, at, size, reach):
+            key = FREE
+            key_of_voxel[voxel] = FREE
+        if key == FREE:
             free[left] = voxel
             left += 1
         else:
-            slot = _find(table, _cell_of_key(key))
+            slot = find_slot(table, cell_of_key(key))
             table[slot, 0] = key
-            table[slot, 1] = (wp.int64(voxel) << wp.int64(8)) | wp.int64(points_in_voxel[voxel])
+            table[slot, 1] = content_of(voxel, points_in_voxel[voxel])
     free_count[0] = left
 
 
@@ -459,15 +281,15 @@ def _mark_free(
     i = wp.tid()
     due = _is_due(pose_in[0], pruned_at[0], step)
     if due:
-        table[i, 0] = _FREE
+        table[i, 0] = FREE
     if i >= key_of_voxel.shape[0]:
         return
     key = key_of_voxel[i]
     at = wp.vec3d(pose_in[0][0, 3], pose_in[0][1, 3], pose_in[0][2, 3])
-    if due and key != _FREE and _is_far(key, at, size, reach):
-        key = _FREE
-        key_of_voxel[i] = _FREE
-    is_free_out[i] = wp.where(key == _FREE, 1, 0)
+    if due and key != FREE and _is_far(key, at, size, reach):
+        key = FREE
+        key_of_voxel[i] = FREE
+    is_free_out[i] = wp.where(key == FREE, 1, 0)
 
 
 @wp.kernel
@@ -496,12 +318,12 @@ def _rebuild(
         free_out[rank_in[voxel] - 1] = voxel
         return
     key = key_of_voxel[voxel]
-    slot = _slot_of(_cell_of_key(key), table.shape[0] - 1)
-    found = wp.atomic_cas(table, slot, 0, _FREE, key)
-    while found != _FREE:
+    slot = first_slot(cell_of_key(key), table.shape[0] - 1)
+    found = wp.atomic_cas(table, slot, 0, FREE, key)
+    while found != FREE:
         slot = (slot + 64) & (table.shape[0] - 1)
-        found = wp.atomic_cas(table, slot, 0, _FREE, key)
-    table[slot, 1] = (wp.int64(voxel) << wp.int64(8)) | wp.int64(points_in_voxel[voxel])
+        found = wp.atomic_cas(table, slot, 0, FREE, key)
+    table[slot, 1] = content_of(voxel, points_in_voxel[voxel])
 
 
 @wp.kernel
@@ -527,10 +349,10 @@ def _clear(
 ):
     """Frees all voxels, so that the first taken is number 0; dim is the table's slots."""
     i = wp.tid()
-    table_out[i, 0] = _FREE
+    table_out[i, 0] = FREE
     voxels = free_out.shape[0]
     if i < voxels:
-        key_of_voxel_out[i] = _FREE
+        key_of_voxel_out[i] = FREE
         free_out[i] = voxels - 1 - i
     if i == 0:
         free_count_out[0] = voxels
@@ -675,6 +497,7 @@ class VoxelMap:
         voxels = np.flatnonzero(keys != -1)
         low = (1 << 21) - 1
         cells = np.stack([keys >> 42, (keys >> 21) & low, keys & low], axis=1)[voxels] - (1 << 20)
-        offsets = self.points.numpy().reshape(self.max_voxels, self.max_points, 3)[voxels]
-        points = cells[:, None, :] * self.voxel_size + offsets
-        return points[np.arange(self.max_points) < self._points_in_voxel.numpy()[voxels, None]]
+        counts = self._points_in_voxel.numpy()[voxels]
+        taken = np.arange(self.max_points) < counts[:, None]
+        offsets = self.points.numpy().reshape(self.max_voxels, self.max_points, 3)[voxels][taken]
+        return np.repeat(cells * self.voxel_size, counts, axis=0) + offsets
