@@ -21,9 +21,17 @@ cos and sin of yaw."""
 
 
 @wp.func
-def _is_peak(maps: wp.array3d(dtype=wp.float32), kind: int, row: int, column: int, least: float) -> bool:
+def _at(maps: wp.array3d(dtype=wp.float32), fold: int, kind: int, row: int, column: int) -> float:
+    """A map's value at a cell, where blocks of 2^fold x 2^fold cells are folded into channels."""
+    mask = (1 << fold) - 1
+    channel = (((kind << fold) + (row & mask)) << fold) + (column & mask)
+    return maps[channel, row >> fold, column >> fold]
+
+
+@wp.func
+def _is_peak(maps: wp.array3d(dtype=wp.float32), fold: int, kind: int, row: int, column: int, least: float) -> bool:
     """Whether a cell is at least as high as its eight neighbours, and higher than those before it."""
-    value = maps[kind, row, column]
+    value = _at(maps, fold, kind, row, column)
     if not (value >= least):
         return False
     peak = bool(True)
@@ -31,8 +39,8 @@ def _is_peak(maps: wp.array3d(dtype=wp.float32), kind: int, row: int, column: in
         for dc in range(-1, 2):
             r = row + dr
             c = column + dc
-            if r >= 0 and r < maps.shape[1] and c >= 0 and c < maps.shape[2]:
-                other = maps[kind, r, c]
+            if r >= 0 and r < maps.shape[1] << fold and c >= 0 and c < maps.shape[2] << fold:
+                other = _at(maps, fold, kind, r, c)
                 before = dr < 0 or (dr == 0 and dc < 0)
                 if other > value or (before and other == value):
                     peak = False
@@ -43,6 +51,7 @@ def _is_peak(maps: wp.array3d(dtype=wp.float32), kind: int, row: int, column: in
 def _count_peaks(
     # in
     maps_in: wp.array3d(dtype=wp.float32),
+    fold: int,
     least: float,
     # out
     peaks_out: wp.array(dtype=wp.int32),
@@ -50,16 +59,17 @@ def _count_peaks(
     """Counts the peaks of each row of each class."""
     kind, row = wp.tid()  # pyright: ignore[reportAssignmentType]
     found = int(0)
-    for column in range(maps_in.shape[2]):
-        if _is_peak(maps_in, kind, row, column, least):
+    for column in range(maps_in.shape[2] << fold):
+        if _is_peak(maps_in, fold, kind, row, column, least):
             found += 1
-    peaks_out[kind * maps_in.shape[1] + row] = found
+    peaks_out[kind * (maps_in.shape[1] << fold) + row] = found
 
 
 @wp.kernel
 def _write_boxes(
     # in
     maps_in: wp.array3d(dtype=wp.float32),
+    fold: int,
     least: float,
     ends_in: wp.array(dtype=wp.int32),
     peaks_in: wp.array(dtype=wp.int32),
@@ -77,7 +87,7 @@ def _write_boxes(
 ):
     """Writes the boxes of each row of each class, from where the rows before it end."""
     kind, row = wp.tid()  # pyright: ignore[reportAssignmentType]
-    line = kind * maps_in.shape[1] + row
+    line = kind * (maps_in.shape[1] << fold) + row
     capacity = scores_out.shape[0]
     if line == ends_in.shape[0] - 1:
         count_out[0] = wp.min(ends_in[line], capacity)
@@ -85,20 +95,26 @@ def _write_boxes(
     if peaks_in[line] == 0:
         return
     slot = ends_in[line] - peaks_in[line]
-    for column in range(maps_in.shape[2]):
-        if _is_peak(maps_in, kind, row, column, least):
+    for column in range(maps_in.shape[2] << fold):
+        if _is_peak(maps_in, fold, kind, row, column, least):
             if slot < capacity:
-                axis = 0.5 * wp.atan2(maps_in[kinds + 7, row, column], maps_in[kinds + 6, row, column])
-                along = wp.cos(axis) * maps_in[kinds + 8, row, column] + wp.sin(axis) * maps_in[kinds + 9, row, column]
+                axis = 0.5 * wp.atan2(
+                    _at(maps_in, fold, kinds + 7, row, column), _at(maps_in, fold, kinds + 6, row, column)
+                )
+                along = wp.cos(axis) * _at(maps_in, fold, kinds + 8, row, column) + wp.sin(axis) * _at(
+                    maps_in, fold, kinds + 9, row, column
+                )
                 if along < 0.0:
                     axis = wp.where(axis > 0.0, axis - wp.PI, axis + wp.PI)
-                boxes_out[slot, 0] = low_x + (float(column) + 0.5 + maps_in[kinds, row, column]) * cell
-                boxes_out[slot, 1] = low_y + (float(row) + 0.5 + maps_in[kinds + 1, row, column]) * cell
-                boxes_out[slot, 2] = maps_in[kinds + 2, row, column] - sensor_height_in[0]
+                boxes_out[slot, 0] = low_x + (float(column) + 0.5 + _at(maps_in, fold, kinds, row, column)) * cell
+                boxes_out[slot, 1] = low_y + (float(row) + 0.5 + _at(maps_in, fold, kinds + 1, row, column)) * cell
+                boxes_out[slot, 2] = _at(maps_in, fold, kinds + 2, row, column) - sensor_height_in[0]
                 for size in range(3):
-                    boxes_out[slot, 3 + size] = wp.exp(wp.clamp(maps_in[kinds + 3 + size, row, column], -4.0, 4.0))
+                    boxes_out[slot, 3 + size] = wp.exp(
+                        wp.clamp(_at(maps_in, fold, kinds + 3 + size, row, column), -4.0, 4.0)
+                    )
                 boxes_out[slot, 6] = axis
-                scores_out[slot] = 1.0 / (1.0 + wp.exp(-maps_in[kind, row, column]))
+                scores_out[slot] = 1.0 / (1.0 + wp.exp(-_at(maps_in, fold, kind, row, column)))
                 classes_out[slot] = kind
             slot += 1
 
@@ -125,12 +141,18 @@ class CenterDecode:
     """Edge of a cell of the maps [m]."""
     capacity: int
     """Most objects."""
+    unfold: int = 1
+    """Blocks of so many by so many cells are folded into channels, a power of two: what a network computes at a coarser
+    step and says at this one. Channel (m · unfold + row mod unfold) · unfold + column mod unfold is of map m."""
     device: str = "cpu"
     """A Warp device, such as `cpu` or `cuda:0`."""
 
     def __post_init__(self):
         if self.shape[0] != self.classes + REGRESSION_MAPS:
             raise ValueError(f"shape must begin with {self.classes} + {REGRESSION_MAPS} maps, not {self.shape[0]}")
+        if self.unfold < 1 or self.unfold & (self.unfold - 1) or any(n % self.unfold for n in self.shape[1:]):
+            raise ValueError(f"unfold must be a power of two that divides rows and columns, not {self.unfold}")
+        object.__setattr__(self, "_fold", self.unfold.bit_length() - 1)
         device = resolve_device(self.device)
 
         def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
@@ -150,7 +172,7 @@ class CenterDecode:
         """Fills `boxes`, `scores`, `classes_found`, `count` and `dropped`.
 
         Args:
-            maps: Shape (1, *shape), float32.
+            maps: Shape (1, maps · unfold², rows / unfold, columns / unfold), float32.
             score_threshold: Least score of an object, in [0, 1].
             sensor_height: Height of the sensor above the ground [m]: a number or a device array of one float32.
         """
@@ -163,12 +185,12 @@ class CenterDecode:
         lines = (self.classes, self.shape[1])
         device = self.scores.device
         flat = maps[0]
-        wp.launch(_count_peaks, lines, inputs=[flat, least], outputs=[self._peaks], device=device)
+        wp.launch(_count_peaks, lines, inputs=[flat, self._fold, least], outputs=[self._peaks], device=device)
         wp.utils.array_scan(self._peaks, self._ends, inclusive=True)
         wp.launch(
             _write_boxes,
             lines,
-            inputs=[flat, least, self._ends, self._peaks, height, *self.origin, self.cell, self.classes],
+            inputs=[flat, self._fold, least, self._ends, self._peaks, height, *self.origin, self.cell, self.classes],
             outputs=[self.boxes, self.scores, self.classes_found, self.count, self.dropped],
             device=device,
         )

@@ -48,7 +48,16 @@ class OutputSpec(_Strict):
 
     name: str
     shape: tuple[int, int, int, int]
+    """1, channels, rows, columns."""
+    unfold: int = Field(1, ge=1)
+    """Blocks of so many by so many cells are folded into channels, see `kernels.decode.CenterDecode`."""
     regression: tuple[str, ...]
+
+    @property
+    def unfolded(self) -> tuple[int, int, int]:
+        """Maps, rows, columns, once the blocks are unfolded."""
+        _, channels, rows, columns = self.shape
+        return channels // self.unfold**2, rows * self.unfold, columns * self.unfold
 
     @field_validator("regression")
     @classmethod
@@ -184,8 +193,8 @@ def _check_consistency(path: Path, card: HeadCard) -> None:
     if spec.shape != wanted_in:
         raise ModelError(f"{path}: input.shape {spec.shape} does not follow from channels, range and cell: {wanted_in}")
     stride = card.decode.stride
-    wanted_out = (1, len(card.classes) + len(card.output.regression), rows // stride, columns // stride)
-    if card.output.shape != wanted_out:
+    wanted_out = (len(card.classes) + len(card.output.regression), rows // stride, columns // stride)
+    if card.output.unfolded != wanted_out:
         raise ModelError(
             f"{path}: output.shape {card.output.shape} does not follow from classes, regression and stride: "
             f"{wanted_out}"

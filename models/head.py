@@ -73,8 +73,9 @@ class DetectionHead:
         self._bind()
         decode = self.card.decode
         self._decode = CenterDecode(
-            shape=self.card.output.shape[1:],
+            shape=self.card.output.unfolded,
             classes=len(self.card.classes),
+            unfold=self.card.output.unfold,
             origin=self.card.input.point_range[:2],
             cell=self.card.input.cell * decode.stride,
             capacity=decode.max_candidates,

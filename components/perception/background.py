@@ -12,7 +12,7 @@ from ...kernels.selection import label_outside_boxes
 from ...models.classes import UNKNOWN
 from ...models.detections import Detections
 from ..execution import ExecutionContext, empty_cloud
-from .cluster_boxes import BoxFit, ClusterBoxes
+from .cluster_boxes import BoxFit, ClusterBoxes, rows_of
 from .filtering import FilteredCloud
 
 __all__ = ["BackgroundConfig", "BackgroundProcessor"]
@@ -78,7 +78,7 @@ class BackgroundProcessor(Processor):
         touched = np.flatnonzero((sizes < found.sizes) & (sizes >= self._config.min_size))
         boxes = found.boxes
         if len(touched):
-            rows = np.flatnonzero(np.isin(left, touched))
+            rows = rows_of(left, touched)
             boxes = boxes.copy()
             boxes[touched] = self._fit.some(cloud.xyz, rows, np.searchsorted(touched, left[rows]), len(touched))
         return boxes, sizes

@@ -62,7 +62,7 @@ class ClusterBoxProcessor(Processor):
         long = np.flatnonzero(boxes[:, 3] > 1.5 * config.split_length)
         if len(long):
             labels, pieces = _cut(cloud.xyz.numpy(), labels, boxes, long, config.split_length)
-            rows = np.flatnonzero(np.isin(labels, pieces))
+            rows = rows_of(labels, pieces)
             boxes = np.concatenate([boxes, np.full((labels.max() + 1 - len(boxes), 7), np.nan, np.float32)])
             boxes[pieces] = self._fit.some(cloud.xyz, rows, np.searchsorted(pieces, labels[rows]), len(pieces))
         lost = max(self.clusters.value.count, len(boxes)) - config.max_boxes
@@ -94,6 +94,13 @@ class BoxFit:
         fitted = self(points, wp.array(labels, dtype=wp.int32, device=self._device), clusters)
         boxes[: len(fitted)] = fitted
         return boxes
+
+
+def rows_of(labels: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The places at which `labels` are among `chosen`, rising."""
+    is_chosen = np.zeros(max(int(labels.max(initial=-1)), int(chosen.max(initial=-1))) + 2, bool)
+    is_chosen[chosen] = True  # the last entry stays False, and is what the label −1 finds
+    return np.flatnonzero(is_chosen[labels])
 
 
 def _cut(

@@ -12,7 +12,7 @@ from torch import nn
 
 from ...kernels.pillar import pillar_channels
 
-__all__ = ["HEAD_CLASSES", "REGRESSION", "STRIDE", "PillarCenterNet"]
+__all__ = ["HEAD_CLASSES", "REGRESSION", "STRIDE", "UNFOLD", "PillarCenterNet"]
 
 HEAD_CLASSES = ("vehicle", "pedestrian", "cyclist", "cone", "barrier")
 """Classes of the heat maps, which are the first channels of the output."""
@@ -23,6 +23,9 @@ the heading twice: of the axis, which is never ambiguous, and of the object, whi
 
 STRIDE = 2
 """Input cells along an edge of an output cell."""
+
+UNFOLD = 2
+"""Output cells along an edge of the last layer's."""
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1, size: int = 3) -> nn.Sequential:
@@ -67,13 +70,13 @@ class PillarCenterNet(nn.Module):
         self.lateral = _convolution(coarse, middle, size=1)
         self.up = nn.Upsample(scale_factor=2, mode="nearest")
         self.merge = _convolution(middle, middle)
-        self.head = nn.Conv2d(middle, outputs * 4, 1)
-        self.unfold = nn.PixelShuffle(2)
+        self.head = nn.Conv2d(middle, outputs * UNFOLD**2, 1)
+        self.unfold = nn.PixelShuffle(UNFOLD)
         # Centres are rare: begin at a probability of 1 % so that the first steps are not spent on unlearning them.
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.zeros_(self.head.bias)
         with torch.no_grad():
-            self.head.bias[: len(HEAD_CLASSES) * 4] = -4.6
+            self.head.bias[: len(HEAD_CLASSES) * UNFOLD**2] = -4.6
 
     def forward(self, pillars: torch.Tensor) -> torch.Tensor:
         """The maps of a batch of pillars."""

@@ -90,3 +90,23 @@ def test_nan_maps_give_nothing():
 def test_a_shape_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="must begin with"):
         CenterDecode(shape=(12, 4, 4), classes=3, origin=(0, 0), cell=0.5, capacity=4)
+
+
+@pytest.mark.parametrize("unfold", [2, 4])
+def test_folded_maps_give_the_same_bytes_as_unfolded_ones(unfold, device):
+    """Folded as torch's PixelUnshuffle does, the inverse of the PixelShuffle that networks end with."""
+    maps = np.random.default_rng(8).normal(0, 1.2, SHAPE).astype(np.float32)
+    m, rows, columns = SHAPE
+    blocks = maps.reshape(m, rows // unfold, unfold, columns // unfold, unfold).transpose(0, 2, 4, 1, 3)
+    folded = np.ascontiguousarray(blocks.reshape(m * unfold**2, rows // unfold, columns // unfold))
+    decode = CenterDecode(
+        shape=SHAPE, classes=3, origin=(-8.0, -6.0), cell=0.5, capacity=512, unfold=unfold, device=device
+    )
+    for one, other in zip(run(plan(device), maps, 0.6), run(decode, folded, 0.6), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("unfold", [0, 3, 16])
+def test_an_unfolding_that_does_not_divide_the_maps_is_refused(unfold):
+    with pytest.raises(ValueError, match="power of two that divides"):
+        CenterDecode(shape=SHAPE, classes=3, origin=(0, 0), cell=0.5, capacity=4, unfold=unfold)

@@ -36,7 +36,8 @@ def test_a_card_reads_back_as_written(card_path, tmp_path):
     card, model = load_card(card_path)
     assert model.name == "pillar_center.onnx"
     assert card.input.shape == (1, 20, 32, 64)
-    assert card.output.shape == (1, 15, 16, 32)
+    assert card.output.shape == (1, 60, 8, 16)
+    assert card.output.unfolded == (15, 16, 32)
     save_card(tmp_path / "again.yaml", card)
     assert load_card(tmp_path / "again.yaml")[0] == card
 
@@ -86,7 +87,7 @@ def test_a_card_that_does_not_fit_is_refused(card_path, changes, message):
             {
                 "input__shape": [1, 20, 32, 32],
                 "input__point_range": [-4, -4, -2, 4, 4, 6],
-                "output__shape": [1, 15, 16, 16],
+                "output__shape": [1, 60, 8, 8],
             },
             "its input is",
         ),
