@@ -15,7 +15,7 @@ from .device import DEFAULT_TAICHI, check_count, give_back, launching, rows_of, 
 __all__ = ["BevMaps", "bev"]
 
 _FULL = 63  # points of a cell whose density is one
-_COUNT, _HIGHEST, _FIRST = range(3)  # the columns of a cell
+_HIGHEST, _FIRST = range(2)  # the columns of a cell
 _LOWEST_BITS = -(2**31)
 _NO_POINT = 2**31 - 1
 
@@ -38,14 +38,16 @@ def _draw(
     high: ti.types.vector(3, ti.f32),
     cells_per_metre: ti.types.vector(2, ti.f32),
     density: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    # in out: as `_clear` leaves it
+    rows: ti.i32,
+    columns: ti.i32,
+    maps_are_zero: ti.i32,
+    # in out: as `_clear` leaves them
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     cells: ti.types.ndarray(dtype=ti.i32, ndim=2),
     # out
     cell_of_point: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    maps: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    maps: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    rows = maps.shape[1]
-    columns = maps.shape[2]
     # How many points each cell has, and the height of its highest.
     for i in range(count):
         x = points[i, 0]
@@ -56,7 +58,7 @@ def _draw(
             row = ti.min(ti.i32((x - low[0]) * cells_per_metre[0]), rows - 1)
             column = ti.min(ti.i32((y - low[1]) * cells_per_metre[1]), columns - 1)
             cell = row * columns + column
-            ti.atomic_add(cells[cell, _COUNT], 1)
+            ti.atomic_add(counts[cell], 1)
             if cells[cell, _HIGHEST] < _in_order(z):
                 ti.atomic_max(cells[cell, _HIGHEST], _in_order(z))
         cell_of_point[i] = cell
@@ -66,30 +68,27 @@ def _draw(
         if cell >= 0 and cells[cell, _HIGHEST] == _in_order(points[i, 2]) and cells[cell, _FIRST] > i:
             ti.atomic_min(cells[cell, _FIRST], i)
     for cell in range(rows * columns):
-        row = cell // columns
-        column = cell - row * columns
-        number = cells[cell, _COUNT]
-        z = 0.0
-        intensity = 0.0
-        thickness = 0.0
+        number = counts[cell]
         if number > 0:
             i = cells[cell, _FIRST]
-            z = points[i, 2]
+            maps[0, cell] = points[i, 2]
+            intensity = 0.0
             if points.shape[1] > 3:
                 intensity = points[i, 3]
-            thickness = density[ti.min(number, _FULL)]
-            cells[cell, _COUNT] = 0
+            maps[1, cell] = intensity
+            maps[2, cell] = density[ti.min(number, _FULL)]
+            counts[cell] = 0
             cells[cell, _HIGHEST] = _LOWEST_BITS
             cells[cell, _FIRST] = _NO_POINT
-        maps[0, row, column] = z
-        maps[1, row, column] = intensity
-        maps[2, row, column] = thickness
+        elif maps_are_zero == 0:
+            maps[0, cell] = 0.0
+            maps[1, cell] = 0.0
+            maps[2, cell] = 0.0
 
 
 @ti.kernel
 def _clear(cells: ti.types.ndarray(dtype=ti.i32, ndim=2)):
     for cell in range(cells.shape[0]):
-        cells[cell, _COUNT] = 0
         cells[cell, _HIGHEST] = _LOWEST_BITS
         cells[cell, _FIRST] = _NO_POINT
 
@@ -108,8 +107,8 @@ class BevMaps:
     """Taichi's device, as `start` takes it."""
 
     maps: Any = field(init=False, repr=False, compare=False)
-    """Height [m], intensity and density per cell, ti.Ndarray, shape (3, rows, columns), float32; zero where there is
-    no point."""
+    """Height [m], intensity and density per cell, ti.Ndarray, shape (3, rows × columns), float32, row by row; zero
+    where there is no point."""
 
     def __post_init__(self):
         if self.capacity < 1:
@@ -136,28 +135,31 @@ class BevMaps:
         scale = (rows / (high[0] - low[0]), columns / (high[1] - low[1]))
         keep("_cells_per_metre", ti.Vector(scale, dt=ti.f32))
         with launching:
-            keep("_cells", workspace((rows * columns, 3), ti.i32))
+            keep("_counts", workspace(rows * columns, ti.i32))
+            keep("_cells", workspace((rows * columns, 2), ti.i32))
             _clear(self._cells)
             density = workspace(_FULL + 1, ti.f32)
             density.from_numpy((np.log1p(np.arange(_FULL + 1)) / np.log(_FULL + 1)).astype(np.float32))
             keep("_density", density)
             keep("_cell_of_point", workspace(self.capacity, ti.i32))
-            keep("maps", workspace((3, rows, columns), ti.f32))
+            keep("maps", workspace((3, rows * columns), ti.f32))
 
-    def launch(self, points: Any, count: int, maps: Any = None) -> None:
+    def launch(self, points: Any, count: int) -> None:
         """Fills `maps` from the first `count` points.
 
         Args:
             points: ti.Ndarray or contiguous NumPy array, float32, shape (n, 3 or more), count ≤ n ≤ capacity: x y z [m]
                 and intensity, which is zero where there are only three columns.
             count: How many points there are.
-            maps: The maps to be filled instead of the plan's own, a ti.Ndarray or NumPy array.
         """
+        self._draw_into(self.maps, points, count, maps_are_zero=False)
+
+    def _draw_into(self, maps: Any, points: Any, count: int, maps_are_zero: bool) -> None:
         check_count(count, points, self.capacity)
         with launching:
             _draw(
                 *(points, count, self._low, self._high, self._cells_per_metre, self._density),
-                *(self._cells, self._cell_of_point, self.maps if maps is None else maps),
+                *(*self.shape, int(maps_are_zero), self._counts, self._cells, self._cell_of_point, maps),
             )
 
 
@@ -171,6 +173,7 @@ def bev(points: Points, point_range: Sequence[float], shape: Sequence[int]) -> A
         shape=tuple(int(length) for length in shape),
         device=device,
     )
-    maps = np.empty((3, *plan.shape), np.float32)
-    plan.launch(rows_of(points), len(points), maps)
+    maps = np.zeros((3, *plan.shape), np.float32)
+    # On a CPU the kernel works on this very memory, and zeros that are never written cost nothing.
+    plan._draw_into(maps.reshape(3, -1), rows_of(points), len(points), maps_are_zero=device == "taichi:cpu")
     return give_back(maps, points)

@@ -50,7 +50,7 @@ def test_a_plan_leaves_nothing_behind(normal):
     for seed in range(3):
         points = normal(seed, 3000)
         plan.launch(points, 2000)
-        np.testing.assert_array_equal(plan.maps.to_numpy(), bev(points[:2000], RANGE, (80, 80)))
+        np.testing.assert_array_equal(plan.maps.to_numpy().reshape(3, 80, 80), bev(points[:2000], RANGE, (80, 80)))
 
 
 @pytest.mark.parametrize(
