@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .kernels.ground import Ground, GroundSegment, segment_ground
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.motion import MotionCompensation, compensate_motion
+    from .kernels.outliers import RadiusOutliers, StatisticalOutliers, radius_outliers, statistical_outliers
     from .kernels.range_image import RangeImage, RangeProjection, range_image
     from .kernels.registration import Registration, ScanRegistration, register
     from .kernels.roi import PolygonMask, in_polygons
@@ -57,6 +58,7 @@ _HOMES = {
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.motion": ("MotionCompensation", "compensate_motion"),
+    "kernels.outliers": ("RadiusOutliers", "StatisticalOutliers", "radius_outliers", "statistical_outliers"),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
     "kernels.registration": ("Registration", "ScanRegistration", "register"),
     "kernels.roi": ("PolygonMask", "in_polygons"),
@@ -89,11 +91,13 @@ __all__ = [
     "Pipeline",
     "PointFilter",
     "PolygonMask",
+    "RadiusOutliers",
     "RangeImage",
     "RangeProjection",
     "Registration",
     "ScanRegistration",
     "SourceError",
+    "StatisticalOutliers",
     "Tracker",
     "TrackerConfig",
     "Tracks",
@@ -114,11 +118,13 @@ __all__ = [
     "in_polygons",
     "iou_3d",
     "open_source",
+    "radius_outliers",
     "range_image",
     "read",
     "register",
     "rotated_iou_bev",
     "segment_ground",
+    "statistical_outliers",
     "voxel_downsample",
     "voxelize",
 ]
