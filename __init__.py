@@ -29,9 +29,11 @@ if TYPE_CHECKING:
     from .kernels.filters import Filtered, PointFilter, filter_points
     from .kernels.grid_cluster import GridCluster, grid_cluster
     from .kernels.ground import Ground, GroundSegment, segment_ground
+    from .kernels.inverse_perspective import GroundImage, InversePerspective, inverse_perspective
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
     from .kernels.motion import MotionCompensation, compensate_motion
     from .kernels.outliers import RadiusOutliers, StatisticalOutliers, radius_outliers, statistical_outliers
+    from .kernels.projection import Painted, PointPainting, PointProjection, Projected, paint_points, project_points
     from .kernels.range_image import RangeImage, RangeProjection, range_image
     from .kernels.registration import Registration, ScanRegistration, register
     from .kernels.roi import PolygonMask, in_polygons
@@ -56,9 +58,18 @@ _HOMES = {
     "kernels.filters": ("Filtered", "PointFilter", "filter_points"),
     "kernels.grid_cluster": ("GridCluster", "grid_cluster"),
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
+    "kernels.inverse_perspective": ("GroundImage", "InversePerspective", "inverse_perspective"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
     "kernels.motion": ("MotionCompensation", "compensate_motion"),
     "kernels.outliers": ("RadiusOutliers", "StatisticalOutliers", "radius_outliers", "statistical_outliers"),
+    "kernels.projection": (
+        "Painted",
+        "PointPainting",
+        "PointProjection",
+        "Projected",
+        "paint_points",
+        "project_points",
+    ),
     "kernels.range_image": ("RangeImage", "RangeProjection", "range_image"),
     "kernels.registration": ("Registration", "ScanRegistration", "register"),
     "kernels.roi": ("PolygonMask", "in_polygons"),
@@ -83,14 +94,20 @@ __all__ = [
     "FitBoxes",
     "GridCluster",
     "Ground",
+    "GroundImage",
     "GroundSegment",
+    "InversePerspective",
     "Latency",
     "ModelError",
     "MotionCompensation",
+    "Painted",
     "PerceptionFrame",
     "Pipeline",
     "PointFilter",
+    "PointPainting",
+    "PointProjection",
     "PolygonMask",
+    "Projected",
     "RadiusOutliers",
     "RangeImage",
     "RangeProjection",
@@ -116,8 +133,11 @@ __all__ = [
     "giou_3d",
     "grid_cluster",
     "in_polygons",
+    "inverse_perspective",
     "iou_3d",
     "open_source",
+    "paint_points",
+    "project_points",
     "radius_outliers",
     "range_image",
     "read",
