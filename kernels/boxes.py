@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .box_samples import FAR, SAMPLES, sample_evenly, sample_extremes, sample_extremes_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -23,9 +24,7 @@ __all__ = ["FitBoxes", "fit_boxes"]
 # Which of two like angles wins must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_SAMPLES = wp.constant(64)
 _EDGE = wp.constant(0.01)  # [m] nearer to an edge than this is no better
-_FAR = wp.constant(1.0e30)
 _AREA = wp.constant(1)
 _METHODS = {
     # name: (criterion, directions in a quarter turn); the first look takes every fourth
@@ -40,7 +39,7 @@ _NON_FINITE, _TOO_MANY = (wp.constant(i) for i in range(2))
 
 @wp.func
 def _is_finite(p: wp.vec3) -> bool:
-    return wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2])
+    return (p[0] - p[0]) + (p[1] - p[1]) + (p[2] - p[2]) == 0.0
 
 
 @wp.kernel
@@ -142,72 +141,6 @@ def _find_starts(
     start_out[cluster] = low
 
 
-@wp.kernel
-def _sample_evenly(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    start_in: wp.array(dtype=wp.int32),
-    order_in: wp.array(dtype=wp.int32),
-    # out
-    sample_out: wp.array2d(dtype=wp.vec2),
-):
-    """Up to 64 points of a cluster, evenly in its order, relative to its first."""
-    cluster, slot = wp.tid()  # pyright: ignore[reportAssignmentType]
-    first = start_in[cluster]
-    size = start_in[cluster + 1] - first
-    if slot >= wp.min(size, _SAMPLES):
-        return
-    at = slot
-    if size > _SAMPLES:
-        at = slot * (size / _SAMPLES) + slot * (size % _SAMPLES) / _SAMPLES
-    p = xyz_in[order_in[first + at]] - xyz_in[order_in[first]]
-    sample_out[cluster, slot] = wp.vec2(p[0], p[1])
-
-
-@wp.kernel
-def _sample_extremes(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    start_in: wp.array(dtype=wp.int32),
-    order_in: wp.array(dtype=wp.int32),
-    direction_in: wp.array(dtype=wp.vec2),
-    # out
-    sample_out: wp.array2d(dtype=wp.vec2),
-):
-    """The outermost points of a cluster, all of them where it is small, else those in 64 directions."""
-    cluster, quarter = wp.tid()  # pyright: ignore[reportAssignmentType]
-    first = start_in[cluster]
-    size = start_in[cluster + 1] - first
-    if size == 0:
-        return
-    origin = xyz_in[order_in[first]]
-    if size <= _SAMPLES:
-        for k in range(4):
-            if 4 * quarter + k < size:
-                q = xyz_in[order_in[first + 4 * quarter + k]] - origin
-                sample_out[cluster, 4 * quarter + k] = wp.vec2(q[0], q[1])
-        return
-    d = direction_in[quarter * direction_in.shape[0] / (_SAMPLES / 4)]
-    low = wp.vec2(_FAR, _FAR)
-    high = wp.vec2(-_FAR, -_FAR)
-    for k in range(size):
-        p = xyz_in[order_in[first + k]] - origin
-        along = d[0] * p[0] + d[1] * p[1]
-        across = d[0] * p[1] - d[1] * p[0]
-        if along < low[0]:
-            low[0] = along
-            sample_out[cluster, 4 * quarter] = wp.vec2(p[0], p[1])
-        if along > high[0]:
-            high[0] = along
-            sample_out[cluster, 4 * quarter + 1] = wp.vec2(p[0], p[1])
-        if across < low[1]:
-            low[1] = across
-            sample_out[cluster, 4 * quarter + 2] = wp.vec2(p[0], p[1])
-        if across > high[1]:
-            high[1] = across
-            sample_out[cluster, 4 * quarter + 3] = wp.vec2(p[0], p[1])
-
-
 @wp.func
 def _score(
     sample: wp.array2d(dtype=wp.vec2),
@@ -226,10 +159,10 @@ def _score(
         d = direction[(first + lane * step + directions) % directions]
         cos[lane] = d[0]
         sin[lane] = d[1]
-    low_along = _vec8(_FAR)
-    low_across = _vec8(_FAR)
-    high_along = _vec8(-_FAR)
-    high_across = _vec8(-_FAR)
+    low_along = _vec8(FAR)
+    low_across = _vec8(FAR)
+    high_along = _vec8(-FAR)
+    high_across = _vec8(-FAR)
     for k in range(size):
         p = sample[cluster, k]
         along = cos * p[0] + sin * p[1]
@@ -265,7 +198,7 @@ def _score_widely(
 ):
     """The score of every fourth direction."""
     cluster, group = wp.tid()  # pyright: ignore[reportAssignmentType]
-    size = wp.min(start_in[cluster + 1] - start_in[cluster], _SAMPLES)
+    size = wp.min(start_in[cluster + 1] - start_in[cluster], SAMPLES)
     if size > 0:
         first = group * _LANES * _STRIDE
         score_out[cluster, group] = _score(sample_in, cluster, size, direction_in, first, _STRIDE, criterion)
@@ -288,11 +221,11 @@ def _choose_directions(
 ):
     """The best of the directions about the best of the first look; of equals the first. Clears the reach."""
     cluster = wp.tid()
-    size = wp.min(start_in[cluster + 1] - start_in[cluster], _SAMPLES)
+    size = wp.min(start_in[cluster + 1] - start_in[cluster], SAMPLES)
     chosen_out[cluster] = 0
     if size == 0:
         return
-    best = float(-_FAR)
+    best = float(-FAR)
     wide = int(0)
     for group in range(wide_in.shape[1]):
         scores = wide_in[cluster, group]
@@ -302,7 +235,7 @@ def _choose_directions(
                 wide = group * _LANES + lane
     first = wide * _STRIDE - 4
     close = _score(sample_in, cluster, size, direction_in, first, 1, criterion)
-    best = float(-_FAR)
+    best = float(-FAR)
     chosen = int(0)
     for lane in range(8):
         if close[lane] > best:
@@ -312,7 +245,7 @@ def _choose_directions(
     chosen_out[cluster] = (chosen + directions) % directions
     origin_out[cluster] = xyz_in[order_in[start_in[cluster]]]
     for side in range(6):
-        reach_out[cluster, side] = -_FAR
+        reach_out[cluster, side] = -FAR
 
 
 @wp.func
@@ -443,7 +376,7 @@ class FitBoxes:
         clusters = self.max_clusters
         buffer("_start", clusters + 1, wp.int32)
         buffer("_order", self.capacity if device == DEFAULT_DEVICE else 2 * self.capacity, wp.int32)
-        buffer("_sample", (clusters, int(_SAMPLES)), wp.vec2)
+        buffer("_sample", (clusters, int(SAMPLES)), wp.vec2)
         buffer("_wide", (clusters, directions // int(_STRIDE * _LANES)), _vec8)
         buffer("_chosen", clusters, wp.int32)
         buffer("_origin", clusters, wp.vec3)
@@ -472,10 +405,13 @@ class FitBoxes:
         # Where the cluster heads.
         if criterion == int(_AREA):
             inputs = [xyz, self._start, self._order, self._direction]
-            self._run(_sample_extremes, (clusters, int(_SAMPLES) // 4), inputs, [self._sample])
+            if self.boxes.device.is_cpu:
+                self._run(sample_extremes_in_order, clusters, inputs, [self._sample])
+            else:
+                self._run(sample_extremes, (clusters, int(SAMPLES) // 4), inputs, [self._sample])
         else:
             inputs = [xyz, self._start, self._order]
-            self._run(_sample_evenly, (clusters, int(_SAMPLES)), inputs, [self._sample])
+            self._run(sample_evenly, (clusters, int(SAMPLES)), inputs, [self._sample])
         inputs = [self._sample, self._start, self._direction, criterion]
         self._run(_score_widely, self._wide.shape, inputs, [self._wide])
         inputs = [xyz, self._start, self._order, self._sample, self._direction, self._wide, criterion]

@@ -6,6 +6,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warploom.kernels.box_samples import sample_extremes
 from warploom.kernels.boxes import FitBoxes, fit_boxes
 
 
@@ -198,3 +199,20 @@ def test_the_plan_counts_what_it_leaves_out(device, method):
 def test_wrong_arguments_are_refused(call, error, message):
     with pytest.raises(error, match=message):
         call(np.zeros((4, 3), np.float32), np.zeros(4, np.int32))
+
+
+def test_a_cpu_samples_the_same_extremes_as_a_gpu():
+    """The two kernels on one device: a cluster of few points, one of many, one of equal points, none."""
+    rng = np.random.default_rng(3)
+    points = rng.normal(0, [4, 2, 1], (3_000, 3)).astype(np.float32)
+    labels = rng.choice([0, 1, 1, 1, 1, 3], 3_000).astype(np.int32)
+    points[labels == 3] = points[0]
+    labels[np.flatnonzero(labels == 0)[40:]] = -1
+    plan = FitBoxes(capacity=3_000, max_clusters=4, method="min_area")
+    xyz = wp.array(points, dtype=wp.vec3, device="cpu")
+    plan.launch(xyz, wp.array(labels, dtype=wp.int32, device="cpu"), wp.array([3_000], dtype=wp.int32, device="cpu"))
+    samples = plan._sample.numpy().copy()
+    plan._sample.zero_()
+    inputs = [xyz, plan._start, plan._order, plan._direction]
+    wp.launch(sample_extremes, (4, 16), inputs, [plan._sample], device="cpu")
+    np.testing.assert_array_equal(plan._sample.numpy(), samples)
