@@ -8,7 +8,7 @@ import pytest
 from warploom.bench.contest import Contest
 from warploom.bench.scans import Scans
 
-_PEERS = ("spconv", "small-gicp", "open3d", "pypatchworkpp", "scipy", "scikit-learn", "shapely")
+_PEERS = ("spconv", "small-gicp", "kiss-icp", "open3d", "pypatchworkpp", "scipy", "scikit-learn", "shapely")
 _skipped: dict[str, str] = {}
 
 
