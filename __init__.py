@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .kernels.voxel_map import VoxelMap
     from .models.head import DetectionHead
+    from .models.odometry import Odometry, OdometryConfig
     from .models.tracker import Tracker, TrackerConfig, Tracks
 
 __version__ = "0.1.0"
@@ -76,6 +77,7 @@ _HOMES = {
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "kernels.voxel_map": ("VoxelMap",),
     "models.head": ("DetectionHead",),
+    "models.odometry": ("Odometry", "OdometryConfig"),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -100,6 +102,8 @@ __all__ = [
     "Latency",
     "ModelError",
     "MotionCompensation",
+    "Odometry",
+    "OdometryConfig",
     "Painted",
     "PerceptionFrame",
     "Pipeline",
