@@ -106,15 +106,15 @@ class Augmentation:
 
     shift: float = 20.0
     """Largest displacement along x and y [m]: the window learnt from is smaller than the scan."""
-    scale: float = 0.05
+    scale: float = 0.04
     """Largest relative change of all lengths."""
-    height: float = 0.2
+    height: float = 0.15
     """Largest error of the sensor's height [m]."""
     tilt: float = 0.015
     """Largest slope of the ground about x and y [rad]."""
-    thin_rings: float = 0.25
+    thin_rings: float = 0.1
     """Share of the frames that lose every second, or three of four, of their rings."""
-    thin_points: float = 0.4
+    thin_points: float = 0.2
     """Share of the frames that lose a random part of their points, up to 60 %."""
 
 

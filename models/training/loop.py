@@ -59,6 +59,8 @@ class TrainingConfig:
     workers_nice: int = 10
     """How far those stand back for other processes."""
     augmentation: Augmentation = field(default_factory=Augmentation)
+    start_from: Path | None = None
+    """Checkpoint of another training, whose weights this one begins with, on a learning rate cycle of its own."""
 
     def __post_init__(self):
         if (self.minutes is None) == (self.iterations is None):
@@ -209,6 +211,12 @@ def train(config: TrainingConfig) -> TrainingResult:
         optimiser.load_state_dict(state["optimiser"])
         iteration, spent = state["iteration"], state["minutes"]
         _log.info("resuming from iteration %d, minute %.1f", iteration, spent)
+    elif config.start_from is not None:
+        state = torch.load(config.start_from, weights_only=True)
+        network.load_state_dict(state["network"])
+        averaged.load_state_dict(state["averaged"])
+        optimiser.load_state_dict(state["optimiser"])
+        _log.info("starting from %s at its iteration %d", config.start_from, state["iteration"])
 
     workers = _start_workers(config)
     there = _frames_there(config)
