@@ -24,6 +24,7 @@ wp.set_module_options({"fuse_fp": False})
 _FARTHEST = 2.0**20  # [m]; float32 has steps of 6 cm there
 _LARGEST_CELL = 2.0**30
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))
+_DRAW, _MIX, _MIX_AGAIN = (wp.constant(wp.uint32(n)) for n in (0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35))
 _NO_POINT = wp.constant(wp.int32(2**31 - 1))
 _NO_KEY = wp.constant(wp.int64(2**63 - 1))
 _FIRST = wp.constant(1)
@@ -47,8 +48,9 @@ def _is_usable(point: wp.vec3, limit: float) -> bool:
     x = wp.abs(point[0])
     y = wp.abs(point[1])
     z = wp.abs(point[2])
-    # A maximum may hide a NaN, a sum does not.
-    return wp.max(wp.max(x, y), z) < limit and x + y + z < 4.0 * limit
+    # A maximum may hide a NaN, a sum does not; and a small one tells all.
+    total = x + y + z
+    return total < 0.5 * limit or (total < 4.0 * limit and wp.max(wp.max(x, y), z) < limit)
 
 
 @wp.func
@@ -64,7 +66,7 @@ def _cell_of(point: wp.vec3, inverse_size: float) -> wp.vec3i:
 
 @wp.func
 def _differ(a: wp.vec3i, b: wp.vec3i) -> bool:
-    return a[0] != b[0] or a[1] != b[1] or a[2] != b[2]
+    return ((a[0] ^ b[0]) | (a[1] ^ b[1]) | (a[2] ^ b[2])) != 0  # one branch, where `or` makes three
 
 
 @wp.func
@@ -82,9 +84,9 @@ def _hash(cell: wp.vec3i) -> int:
 @wp.func
 def _key_of(point: int, seed: wp.uint32) -> wp.int64:
     """A number drawn for a point, by MurmurHash3's finalizer, and the point: the least of a voxel's is chosen."""
-    drawn = wp.uint32(point) * wp.uint32(0x9E3779B9) + seed
-    drawn = (drawn ^ (drawn >> wp.uint32(16))) * wp.uint32(0x85EBCA6B)
-    drawn = (drawn ^ (drawn >> wp.uint32(13))) * wp.uint32(0xC2B2AE35)
+    drawn = wp.uint32(point) * _DRAW + seed
+    drawn = (drawn ^ (drawn >> wp.uint32(16))) * _MIX
+    drawn = (drawn ^ (drawn >> wp.uint32(13))) * _MIX_AGAIN
     drawn = (drawn ^ (drawn >> wp.uint32(16))) >> wp.uint32(1)
     return (wp.int64(drawn) << wp.int64(32)) | wp.int64(point)
 

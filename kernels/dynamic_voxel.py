@@ -69,7 +69,7 @@ def _gather_in_order(
             voxel_of_point_out[i] = -1
         else:
             # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if voxel[0] != before[0] or voxel[1] != before[1] or voxel[2] != before[2]:
+            if ((voxel[0] ^ before[0]) | (voxel[1] ^ before[1]) | (voxel[2] ^ before[2])) != 0:
                 before = voxel
                 cell = cell_number(voxel, grid)
                 slot = slot_of(cell, mask)

@@ -107,7 +107,7 @@ def _voxelize_in_order(
             outside += 1
         else:
             # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if voxel[0] != before[0] or voxel[1] != before[1] or voxel[2] != before[2]:
+            if ((voxel[0] ^ before[0]) | (voxel[1] ^ before[1]) | (voxel[2] ^ before[2])) != 0:
                 before = voxel
                 slot = int(0)
                 cell = wp.int64(0)
