@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from .kernels.ground import Ground, GroundSegment, segment_ground
     from .kernels.inverse_perspective import GroundImage, InversePerspective, inverse_perspective
     from .kernels.iou import giou_3d, iou_3d, rotated_iou_bev
+    from .kernels.kalman import KalmanFilter, KalmanUpdate, kalman_predict, kalman_update
     from .kernels.motion import MotionCompensation, compensate_motion
     from .kernels.outliers import RadiusOutliers, StatisticalOutliers, radius_outliers, statistical_outliers
     from .kernels.projection import Painted, PointPainting, PointProjection, Projected, paint_points, project_points
@@ -61,6 +62,7 @@ _HOMES = {
     "kernels.ground": ("Ground", "GroundSegment", "segment_ground"),
     "kernels.inverse_perspective": ("GroundImage", "InversePerspective", "inverse_perspective"),
     "kernels.iou": ("giou_3d", "iou_3d", "rotated_iou_bev"),
+    "kernels.kalman": ("KalmanFilter", "KalmanUpdate", "kalman_predict", "kalman_update"),
     "kernels.motion": ("MotionCompensation", "compensate_motion"),
     "kernels.outliers": ("RadiusOutliers", "StatisticalOutliers", "radius_outliers", "statistical_outliers"),
     "kernels.projection": (
@@ -99,6 +101,8 @@ __all__ = [
     "GroundImage",
     "GroundSegment",
     "InversePerspective",
+    "KalmanFilter",
+    "KalmanUpdate",
     "Latency",
     "ModelError",
     "MotionCompensation",
@@ -139,6 +143,8 @@ __all__ = [
     "in_polygons",
     "inverse_perspective",
     "iou_3d",
+    "kalman_predict",
+    "kalman_update",
     "open_source",
     "paint_points",
     "project_points",
