@@ -25,7 +25,11 @@ wp.set_module_options({"fuse_fp": False})
 
 _RUN = wp.constant(256)  # points that one thread sums
 _MOST_NEIGHBORS = 1024
+_WINDOW = wp.constant(3)  # leaves on either side of one that tell how far neighbours may be
+_LARGEST = wp.constant(3.0e38)
 _FARTHEST = wp.constant(wp.float64(3.0e38))
+
+_Eight = wp.types.vector(length=int(LEAF), dtype=wp.float32)
 
 
 @wp.func
@@ -112,51 +116,125 @@ def _find_lonely(
 # ---- by statistics
 
 
-@wp.func
-def _offer(
-    squared: float,
-    q: int,
-    wanted: int,
-    first: int,
-    lanes: int,
-    nearest: wp.array(dtype=wp.float32),
-    farthest: wp.array(dtype=wp.float32),
-    filled: wp.array(dtype=wp.int32),
-    worst: wp.array(dtype=wp.int32),
+@wp.kernel
+def _lay_out(
+    # in
+    points_in: wp.array(dtype=wp.vec3),
+    size_in: wp.array(dtype=wp.int32),
+    # out
+    x_out: wp.array(dtype=_Eight),
+    y_out: wp.array(dtype=_Eight),
+    z_out: wp.array(dtype=_Eight),
 ):
-    """Takes a squared distance into a full list in the place of its greatest, or into one that is not full yet."""
-    place = filled[q]
-    if place < wanted:
-        filled[q] = place + 1
-    else:
-        place = worst[q]
-    nearest[first + place * lanes] = squared
-    if filled[q] == wanted:
-        greatest = float(-1.0)
-        at = int(0)
-        for k in range(wanted):
-            value = nearest[first + k * lanes]
-            at = wp.where(value > greatest, k, at)
-            greatest = wp.max(value, greatest)
-        worst[q] = at
-        farthest[q] = greatest
+    """Coordinates of a leaf side by side, for vector instructions; where it has no point, infinitely far."""
+    leaf = wp.tid()
+    x = _Eight(wp.inf)
+    y = _Eight(wp.inf)
+    z = _Eight(wp.inf)
+    for k in range(LEAF):
+        i = leaf * LEAF + k
+        if i < size_in[0]:
+            p = points_in[i]
+            x[k] = p[0]
+            y[k] = p[1]
+            z[k] = p[2]
+    x_out[leaf] = x
+    y_out[leaf] = y
+    z_out[leaf] = z
+
+
+@wp.func
+def _squares(p: wp.vec3, x: _Eight, y: _Eight, z: _Eight) -> _Eight:
+    """Squared distances to the points of a leaf."""
+    dx = x - _Eight(p[0])
+    dy = y - _Eight(p[1])
+    dz = z - _Eight(p[2])
+    return wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
+
+
+@wp.func
+def _keep_least(values: wp.array(dtype=wp.float32), first: int, step: int, count: int, wanted: int) -> float:
+    """Moves the least `wanted` of `count` numbers to the front (quickselect); gives the greatest of them."""
+    low = int(0)
+    high = int(count - 1)
+    while low < high:
+        # The median of three as pivot, put last.
+        middle = (low + high) // 2
+        a = values[first + low * step]
+        b = values[first + middle * step]
+        c = values[first + high * step]
+        pivot = wp.max(wp.min(a, b), wp.min(wp.max(a, b), c))
+        if pivot == a:
+            values[first + low * step] = c
+        elif pivot == b:
+            values[first + middle * step] = c
+        values[first + high * step] = pivot
+        # Those below the pivot to the front; written so that nothing hangs on a guess of the processor.
+        at = first + low * step
+        end = first + high * step
+        to = int(at)
+        while at < end:
+            value = values[at]
+            values[at] = values[to]
+            values[to] = value
+            to += wp.where(value < pivot, step, 0)
+            at += step
+        values[end] = values[to]
+        values[to] = pivot
+        place = (to - first) // step
+        if place == wanted - 1:
+            low = place
+            high = place
+        elif place < wanted - 1:
+            low = place + 1
+        else:
+            high = place - 1
+    return values[first + (wanted - 1) * step]
+
+
+@wp.func
+def _append(
+    squares: _Eight,
+    reach: float,
+    wanted: int,
+    room: int,
+    q: int,
+    step: int,
+    nearest: wp.array(dtype=wp.float32),
+    filled: wp.array(dtype=wp.int32),
+) -> float:
+    """Notes which of eight squared distances are within reach; where that fills the list, narrows the reach."""
+    to = q + filled[q] * step
+    for k in range(LEAF):
+        nearest[to] = squares[k]
+        to += wp.where(squares[k] < reach, step, 0)
+    count = (to - q) // step
+    narrowed = float(reach)
+    if count > room - LEAF:
+        narrowed = _keep_least(nearest, q, step, count, wanted)
+        count = wanted
+    filled[q] = count
+    return narrowed
 
 
 @wp.kernel
 def _mean_distances(
     # in
     points_in: wp.array(dtype=wp.vec3),
+    x_in: wp.array(dtype=_Eight),
+    y_in: wp.array(dtype=_Eight),
+    z_in: wp.array(dtype=_Eight),
     size_in: wp.array(dtype=wp.int32),
     low_in: wp.array(dtype=wp.vec3),
     high_in: wp.array(dtype=wp.vec3),
     leaves: int,
     neighbors: int,
+    room: int,
     lanes: int,
-    # in out: per point of a lane its list, the greatest of it and where that is, and how many it has
+    # in out: of each point of a lane its list, how many it has, and within what they are
     nearest: wp.array(dtype=wp.float32),
-    farthest: wp.array(dtype=wp.float32),
     filled: wp.array(dtype=wp.int32),
-    worst: wp.array(dtype=wp.int32),
+    within: wp.array(dtype=wp.float32),
     # out
     mean_out: wp.array(dtype=wp.float32),
 ):
@@ -168,13 +246,27 @@ def _mean_distances(
     if members <= 0:
         return
     wanted = wp.min(neighbors, size - 1)
-    lane = (leaf * LEAF) % lanes
-    for q in range(lane, lane + members):
-        filled[q] = 0
-        farthest[q] = wp.inf
+    lane = begin % lanes
     own_low = low_in[leaves + leaf]
     own_high = high_in[leaves + leaf]
-    limit = float(wp.inf)
+    # How far the neighbours of the leaf's centre are, at most: by the points next in the order.
+    centre = 0.5 * own_low + 0.5 * own_high
+    found = int(0)
+    for other in range(wp.max(leaf - _WINDOW, 0), wp.min(leaf + _WINDOW, leaves - 1) + 1):
+        squares = _squares(centre, x_in[other], y_in[other], z_in[other])
+        for k in range(LEAF):
+            nearest[lane + found * lanes] = squares[k]
+            found += wp.where(squares[k] < _LARGEST, 1, 0)
+    reach = float(wp.inf)
+    if found > wanted:
+        reach = wp.sqrt(_keep_least(nearest, lane, lanes, found, wanted + 1))
+    limit = float(0.0)
+    for member in range(members):
+        q = lane + member
+        filled[q] = 0
+        way = reach + wp.sqrt(_distance_squared(points_in[begin + member], centre))
+        within[q] = way * way * 1.00001 + 1.0e-37
+        limit = wp.max(limit, within[q])
     node = leaves + leaf
     root = int(node)
     while node > 0 and wanted > 0:
@@ -188,21 +280,23 @@ def _mean_distances(
             elif at < leaves:
                 at = 2 * at
             else:
-                other = (at - leaves) * LEAF
-                end = wp.min(other + LEAF, size)
+                x = x_in[at - leaves]
+                y = y_in[at - leaves]
+                z = z_in[at - leaves]
                 limit = float(0.0)
                 for member in range(members):
-                    i = begin + member
                     q = lane + member
-                    p = points_in[i]
-                    reach = farthest[q]
-                    if gap_squared(p, low, high) < reach:
-                        for j in range(other, end):
-                            squared = _distance_squared(p, points_in[j])
-                            if squared < reach and j != i:
-                                _offer(squared, q, wanted, q, lanes, nearest, farthest, filled, worst)
-                                reach = farthest[q]
-                    limit = wp.max(limit, reach)
+                    p = points_in[begin + member]
+                    near = within[q]
+                    if gap_squared(p, low, high) < near:
+                        squares = _squares(p, x, y, z)
+                        if at - leaves == leaf:
+                            for k in range(LEAF):
+                                if k == member:
+                                    squares[k] = wp.inf
+                        near = _append(squares, near, wanted, room, q, lanes, nearest, filled)
+                        within[q] = near
+                    limit = wp.max(limit, near)
                 at = next_node(at, root)
         if root != node:
             node = node >> 1
@@ -210,10 +304,13 @@ def _mean_distances(
         if node == 1:
             node = 0
     for member in range(members):
+        q = lane + member
+        if filled[q] > wanted and wanted > 0:
+            _keep_least(nearest, q, lanes, filled[q], wanted)
         total = wp.float64(0.0)
         for k in range(wanted):
-            if k < filled[lane + member]:
-                total += wp.sqrt(wp.float64(nearest[lane + member + k * lanes]))
+            if k < filled[q]:
+                total += wp.sqrt(wp.float64(nearest[q + k * lanes]))
             else:
                 total += _FARTHEST  # whose square no float32 holds
         mean_out[begin + member] = float(total / wp.float64(wp.max(wanted, 1)))
@@ -358,10 +455,12 @@ class StatisticalOutliers:
 
         keep("_tree", tree)
         keep("_lanes", lanes)
-        keep("_nearest", wp.zeros(self.neighbors * lanes, dtype=wp.float32, device=device))
-        keep("_farthest", wp.zeros(lanes, dtype=wp.float32, device=device))
+        room = max(self.neighbors + 4 * int(LEAF), (2 * int(_WINDOW) + 2) * int(LEAF))
+        keep("_room", room)
+        keep("_nearest", wp.zeros(room * lanes, dtype=wp.float32, device=device))
         keep("_filled", wp.zeros(lanes, dtype=wp.int32, device=device))
-        keep("_worst", wp.zeros(lanes, dtype=wp.int32, device=device))
+        keep("_within", wp.zeros(lanes, dtype=wp.float32, device=device))
+        keep("_eights", [wp.zeros(tree.leaves, dtype=_Eight, device=device) for _ in range(3)])
         keep("_mean", wp.zeros(self.capacity, dtype=wp.float32, device=device))
         keep("_sums", wp.zeros(-(-self.capacity // _RUN), dtype=wp.float64, device=device))
         keep("threshold", wp.zeros(2, dtype=wp.float64, device=device))
@@ -380,11 +479,13 @@ class StatisticalOutliers:
         def run(kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
             wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
 
+        run(_lay_out, tree.leaves, [tree.points, tree.size], self._eights)
+        boxes = [tree.size, tree.low, tree.high, tree.leaves]
         run(
             _mean_distances,
             tree.leaves,
-            [tree.points, tree.size, tree.low, tree.high, tree.leaves, self.neighbors, self._lanes],
-            [self._nearest, self._farthest, self._filled, self._worst, self._mean],
+            [tree.points, *self._eights, *boxes, self.neighbors, self._room, self._lanes],
+            [self._nearest, self._filled, self._within, self._mean],
         )
         for squares in (0, 1):
             run(_sum_runs, self._sums.shape[0], [self._mean, tree.size, self.threshold, squares], [self._sums])
