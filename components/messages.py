@@ -55,6 +55,8 @@ class SensorFrame:
     """The frame of the points."""
     pose: np.ndarray | None = None
     """World from sensor, shape (4, 4), float64; None where the ego pose is unknown."""
+    continues: bool = True
+    """False where it has nothing to do with the frame before, as in a data set of single scans: tracks begin anew."""
     truth: Truth | None = None
 
 

@@ -26,6 +26,8 @@ class TrackingProcessor(Processor):
         """Takes up the detections of one frame."""
         detected = self.detected.value
         sensor, detections = detected.sensor, detected.detections
+        if not sensor.continues:
+            self._tracker.clear()
         tracks = self._tracker.update(
             sensor.version,
             detections.boxes,

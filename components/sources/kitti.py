@@ -77,6 +77,7 @@ class KittiSource(FrameListSource):
             points=scan.points,
             frame_id=self.frame_id,
             pose=None if self._poses is None else self._poses[index],
+            continues=self.layout != "object",
             truth=truth,
         )
 

@@ -1,5 +1,7 @@
 """The stages alone, by the harness: no graph, no runtime."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -120,6 +122,15 @@ def test_tracking_says_over_ground_only_where_the_pose_is_known(stages, sensor):
     assert tracked.velocity_reference == "world"
     assert tracked.version == sensor.version
     assert (~tracked.background).sum() == len(stages["foreground"])
+
+
+def test_a_frame_that_does_not_continue_the_one_before_begins_new_tracks_at_once(stages, sensor):
+    tracking = ProcessorHarness(TrackingProcessor)
+    first = tracking.feed(detected=stages["detected"]).run(sensor.version)["obstacles"]
+    elsewhere = dataclasses.replace(sensor, version=sensor.version + 1, continues=False)
+    second = tracking.feed(detected=dataclasses.replace(stages["detected"], sensor=elsewhere)).run(elsewhere.version)
+    assert len(second["obstacles"]) == len(first)
+    assert not set(second["obstacles"].ids) & set(first.ids)
 
 
 def test_the_head_finds_most_of_the_near_vehicles(stages, sensor):
