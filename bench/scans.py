@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..models.evaluation.ground import SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, GroundLabels
+from ..models.geometry import KittiCalibration, kitti_poses
 
 if TYPE_CHECKING:
     from ..models.simulator import SimulatedFrame
@@ -47,6 +48,7 @@ class Scans:
         """
         self._data = data
         self._kept: dict[str, np.ndarray] = {}
+        self._drives: dict[str, tuple[list[np.ndarray], np.ndarray]] = {}
 
     @functools.cached_property
     def street(self) -> list[SimulatedFrame]:
@@ -83,6 +85,39 @@ class Scans:
             raise FileNotFoundError(f"the real scans (../shared/data/{name}) are not here")
         return self._data / name
 
+    def drive(self, name: str) -> tuple[list[np.ndarray], np.ndarray]:
+        """The scans of a drive, each of shape (n, 4), float32, and its poses, first scan from each, shape (n, 4, 4).
+
+        Args:
+            name: `street`, the simulated one; or `KITTI`, ten seconds, with the poses of its GPS and IMU.
+
+        Raises:
+            FileNotFoundError: It is the real one, and the real scans are not here.
+        """
+        if name not in self._drives:
+            self._drives[name] = self._street_drive() if name == "street" else self._kitti_drive()
+        return self._drives[name]
+
+    def _street_drive(self) -> tuple[list[np.ndarray], np.ndarray]:
+        poses = np.stack([frame.pose for frame in self.street])
+        return [frame.points for frame in self.street], np.linalg.inv(poses[0]) @ poses
+
+    def _kitti_drive(self) -> tuple[list[np.ndarray], np.ndarray]:
+        folder = self._folder("kitti_tracking")
+        lidar_from_imu = KittiCalibration.read(folder / "calib" / "0000.txt").lidar_from_imu
+        poses = kitti_poses(np.loadtxt(folder / "oxts" / "0000.txt"), lidar_from_imu)
+        return [_unpack(path) for path in sorted((folder / "velodyne_packed" / "0000").glob("*.npz"))], poses
+
+    def pair(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Two real scans half a metre apart, source and target, shape (n, 4), and target from source, shape (4, 4).
+
+        Raises:
+            FileNotFoundError: The real scans are not here.
+        """
+        folder = self._folder("registration_pair")
+        clouds = [_read_ply(folder / f"{name}.ply") for name in ("source", "target")]
+        return clouds[0], clouds[1], np.loadtxt(folder / "T_target_source.txt")
+
     @functools.cached_property
     def labelled(self) -> dict[str, list[LabelledScan]]:
         """The scans whose ground is labelled, by set.
@@ -110,6 +145,20 @@ class Scans:
 
 def _read_bin(path: Path) -> np.ndarray:
     return np.fromfile(path, np.float32).reshape(-1, 4)
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    raw = path.read_bytes()
+    return np.frombuffer(raw[raw.index(b"end_header\n") + 11 :], np.float32).reshape(-1, 4).copy()
+
+
+def _unpack(path: Path) -> np.ndarray:
+    """The points of a losslessly packed scan, shape (n, 4), float32."""
+    file = np.load(path)
+    low, middle, high = file["planes"].astype(np.int64)
+    zigzag = low | middle << 8 | high << 16
+    xyz = np.cumsum((zigzag >> 1) ^ -(zigzag & 1), axis=1).T / 1000
+    return np.column_stack([xyz, file["intensity_x100"] / 100]).astype(np.float32)
 
 
 def _labelled(points: np.ndarray, labels: np.ndarray, meaning: GroundLabels) -> LabelledScan:

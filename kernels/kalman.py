@@ -208,19 +208,24 @@ def _update(
                 innovation = z - state[i, k]
                 if k == _YAW:
                     innovation = _wrapped(innovation)
+                inverse = noise_in.dtype(1.0) / variance
+                pull = innovation * inverse
                 for a in range(size):
-                    state[i, a] = state[i, a] + p[i, a, k] / variance * innovation
+                    state[i, a] = state[i, a] + p[i, a, k] * pull
                 # P − P[:, k] P[k, :] / variance, which leaves of row and column k the share r / variance.
                 for a in range(size):
                     if a != k:
-                        for b in range(size):
+                        gain = p[i, a, k] * inverse
+                        for b in range(a, size):
                             if b != k:
-                                p[i, a, b] = p[i, a, b] - p[i, a, k] * p[i, k, b] / variance
-                left = r / variance
+                                rest = p[i, a, b] - gain * p[i, k, b]
+                                p[i, a, b] = rest
+                                p[i, b, a] = rest
+                left = r * inverse
                 for a in range(size):
                     if a != k:
                         p[i, a, k] = p[i, a, k] * left
-                        p[i, k, a] = p[i, k, a] * left
+                        p[i, k, a] = p[i, a, k]
                 p[i, k, k] = p[i, k, k] * left
                 distance += innovation * innovation / variance
                 log_determinant += wp.log(variance)
