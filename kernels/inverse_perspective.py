@@ -25,6 +25,8 @@ __all__ = ["GroundImage", "InversePerspective", "inverse_perspective"]
 wp.set_module_options({"fuse_fp": False})
 
 _FLAT = (0.0, 0.0, 1.0, 0.0)
+_UNSEEN = wp.constant(-1)
+_Bytes = wp.types.vector(length=3, dtype=wp.uint8)
 
 
 @wp.struct
@@ -35,57 +37,106 @@ class _Ground:
 
 
 @wp.kernel
-def _sample_ground(
+def _find_pixels(
     # in
-    image_in: wp.array(dtype=Any),
-    width: int,
-    height: int,
-    channels: int,
     camera: Camera,
     ground: _Ground,
-    rounding: float,
+    width: int,
+    height: int,
     columns: int,
     # out
-    ground_out: wp.array(dtype=Any),
+    place_out: wp.array(dtype=wp.int32),
+    share_out: wp.array(dtype=wp.vec2),
     seen_out: wp.array(dtype=wp.bool),
 ):
-    """One cell a thread: what the image says, bilinearly, where the camera sees the cell's centre."""
+    """Per cell the upper left of the four pixels about its centre, and how far it is towards the lower right."""
     cell = wp.tid()
     p = ground.first + float(cell // columns) * ground.along_row + float(cell % columns) * ground.along_column
     pixel = image_point(p, camera)
     seen = is_in_image(pixel, width, height)
+    place = int(_UNSEEN)
+    if seen:
+        u = wp.clamp(pixel[0], 0.0, float(width - 1))
+        v = wp.clamp(pixel[1], 0.0, float(height - 1))
+        # The last row and column are reached from those before them.
+        left = wp.max(wp.min(int(u), width - 2), 0)
+        top = wp.max(wp.min(int(v), height - 2), 0)
+        place = top * width + left
+        share_out[cell] = wp.vec2(u - float(left), v - float(top))
+    place_out[cell] = place
     seen_out[cell] = seen
-    to = cell * channels
-    if not seen:
-        for channel in range(channels):
-            ground_out[to + channel] = ground_out.dtype(0.0)
+
+
+@wp.kernel
+def _sample_three_bytes(
+    # in
+    image_in: wp.array(dtype=_Bytes),
+    place_in: wp.array(dtype=wp.int32),
+    share_in: wp.array(dtype=wp.vec2),
+    right: int,
+    down: int,
+    # out
+    ground_out: wp.array(dtype=_Bytes),
+):
+    """One cell a thread, for the images that most cameras give."""
+    cell = wp.tid()
+    place = place_in[cell]
+    value = wp.vec3(0.0)
+    if place != _UNSEEN:
+        a = share_in[cell][0]
+        b = share_in[cell][1]
+        p = image_in[place]
+        q = image_in[place + right]
+        r = image_in[place + down]
+        s = image_in[place + down + right]
+        above = wp.vec3(float(p[0]), float(p[1]), float(p[2])) * (1.0 - a)
+        above += wp.vec3(float(q[0]), float(q[1]), float(q[2])) * a
+        below = wp.vec3(float(r[0]), float(r[1]), float(r[2])) * (1.0 - a)
+        below += wp.vec3(float(s[0]), float(s[1]), float(s[2])) * a
+        value = above * (1.0 - b) + below * b + wp.vec3(0.5)
+    ground_out[cell] = _Bytes(wp.uint8(value[0]), wp.uint8(value[1]), wp.uint8(value[2]))
+
+
+@wp.kernel
+def _sample(
+    # in
+    image_in: wp.array2d(dtype=Any),
+    place_in: wp.array(dtype=wp.int32),
+    share_in: wp.array(dtype=wp.vec2),
+    right: int,
+    down: int,
+    rounding: float,
+    # out
+    ground_out: wp.array2d(dtype=Any),
+):
+    """One cell a thread, for images of any channels."""
+    cell = wp.tid()
+    place = place_in[cell]
+    if place == _UNSEEN:
+        for channel in range(image_in.shape[1]):
+            ground_out[cell, channel] = ground_out.dtype(0.0)
         return
-    u = wp.clamp(pixel[0], 0.0, float(width - 1))
-    v = wp.clamp(pixel[1], 0.0, float(height - 1))
-    left = int(u)
-    top = int(v)
-    # The four pixels about it, of which those past the edge weigh nothing.
-    here = (top * width + left) * channels
-    right = wp.where(left < width - 1, here + channels, here)
-    down = wp.where(top < height - 1, width * channels, 0)
-    a = u - float(left)
-    b = v - float(top)
-    for channel in range(channels):
-        above = float(image_in[here + channel])
-        above += (float(image_in[right + channel]) - above) * a
-        below = float(image_in[here + down + channel])
-        below += (float(image_in[right + down + channel]) - below) * a
-        ground_out[to + channel] = ground_out.dtype(above + (below - above) * b + rounding)
+    a = share_in[cell][0]
+    b = share_in[cell][1]
+    for channel in range(image_in.shape[1]):
+        above = float(image_in[place, channel]) * (1.0 - a) + float(image_in[place + right, channel]) * a
+        below = float(image_in[place + down, channel]) * (1.0 - a) + float(image_in[place + down + right, channel]) * a
+        ground_out[cell, channel] = ground_out.dtype(above * (1.0 - b) + below * b + rounding)
 
 
 for _dtype in (wp.uint8, wp.float32):
-    wp.overload(_sample_ground, {"image_in": wp.array(dtype=_dtype), "ground_out": wp.array(dtype=_dtype)})
+    wp.overload(_sample, {"image_in": wp.array2d(dtype=_dtype), "ground_out": wp.array2d(dtype=_dtype)})
 
 
 @dataclass(frozen=True, kw_only=True)
 class InversePerspective:
-    """A plan: draws the ground from a camera's image; `launch` allocates nothing and reads nothing back."""
+    """A plan: `set_camera` finds the pixel of each cell of the ground, `launch` draws the ground from an image.
 
+    Both allocate nothing and read nothing back.
+    """
+
+    image_size: tuple[int, int]
+    """Width and height [pixels]."""
     bev_range: tuple[float, ...]
     """xmin ymin xmax ymax [m] of the ground that is drawn."""
     shape: tuple[int, int]
@@ -105,6 +156,10 @@ class InversePerspective:
     """Out: where the camera sees it, shape (rows, columns), bool."""
 
     def __post_init__(self):
+        if len(self.image_size) != 2 or min(self.image_size) < 1:
+            raise ValueError(f"image_size must be width and height, at least 1 pixel each, not {self.image_size}")
+        if self.image_size[0] * self.image_size[1] * self.channels > 2**31 - 1:
+            raise ValueError(f"image_size {self.image_size} with {self.channels} channels is more than 2³¹ − 1 numbers")
         low, high = self.bev_range[:2], self.bev_range[2:]
         if len(self.bev_range) != 4 or not all(a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)):
             raise ValueError(f"bev_range must be xmin ymin xmax ymax, finite, with min < max, not {self.bev_range}")
@@ -126,36 +181,63 @@ class InversePerspective:
         ground.first = wp.vec3(x, y, -(a * x + b * y + d) / c)
         ground.along_row = wp.vec3(steps[0], 0.0, -a * steps[0] / c)
         ground.along_column = wp.vec3(0.0, steps[1], -b * steps[1] / c)
-        object.__setattr__(self, "_ground", ground)
-        object.__setattr__(self, "ground", wp.zeros((*self.shape, self.channels), dtype=self.dtype, device=device))
-        object.__setattr__(self, "seen", wp.zeros(self.shape, dtype=wp.bool, device=device))
+        cells = self.shape[0] * self.shape[1]
 
-    def launch(self, image: wp.array, camera: Camera) -> None:
-        """Fills `ground` and `seen`.
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        keep("_ground", ground)
+        keep("_drawn_for", None)
+        keep("_place", wp.full(cells, _UNSEEN, dtype=wp.int32, device=device))
+        keep("_share", wp.zeros(cells, dtype=wp.vec2, device=device))
+        keep("ground", wp.zeros((*self.shape, self.channels), dtype=self.dtype, device=device))
+        keep("seen", wp.zeros(self.shape, dtype=wp.bool, device=device))
+
+    def set_camera(self, camera: Camera) -> None:
+        """Finds the pixels of the cells, and fills `seen`.
+
+        Args:
+            camera: From `warploom.kernels.camera.camera_model`, for points in the vehicle's frame.
+        """
+        wp.launch(
+            _find_pixels,
+            self.shape[0] * self.shape[1],
+            inputs=[camera, self._ground, *self.image_size, self.shape[1]],
+            outputs=[self._place, self._share, self.seen.flatten()],
+            device=self.device,
+        )
+
+    def launch(self, image: wp.array) -> None:
+        """Fills `ground`; before the first `set_camera`, with zeros.
 
         Args:
             image: Shape (height, width, channels), of `dtype`, contiguous.
-            camera: From `warploom.kernels.camera.camera_model`, for points in the vehicle's frame.
         """
-        self._sample_into(self.ground, self.seen, image, camera)
+        self._sample_into(self.ground, image)
 
-    def _sample_into(self, ground: wp.array, seen: wp.array, image: wp.array, camera: Camera) -> None:
-        if image.ndim != 3 or image.shape[2] != self.channels or image.dtype != self.dtype or not image.is_contiguous:
+    def _sample_into(self, ground: wp.array, image: wp.array) -> None:
+        width, height = self.image_size
+        wanted = (height, width, self.channels)
+        if tuple(image.shape) != wanted or image.dtype != self.dtype or not image.is_contiguous:
             raise ValueError(
-                f"image must be contiguous {self.dtype.__name__} of shape (height, width, {self.channels}), not "
-                f"{image.dtype.__name__} of {image.shape}"
+                f"image must be contiguous {self.dtype.__name__} of shape {wanted}, not {image.dtype.__name__} of "
+                f"{image.shape}"
             )
-        height, width, channels = image.shape
-        if height * width * channels > 2**31 - 1:
-            raise ValueError(f"image of shape {image.shape} has more than 2³¹ − 1 numbers")
-        rounding = 0.5 if self.dtype == wp.uint8 else 0.0
-        wp.launch(
-            _sample_ground,
-            self.shape[0] * self.shape[1],
-            inputs=[image.flatten(), width, height, channels, camera, self._ground, rounding, self.shape[1]],
-            outputs=[ground.flatten(), seen.flatten()],
-            device=self.device,
-        )
+        # A picture of one row or column has no neighbours there.
+        steps = [min(width - 1, 1), width * min(height - 1, 1)]
+        found, cells = [self._place, self._share, *steps], self._place.shape[0]
+        if self.channels == 3 and self.dtype == wp.uint8:
+            flat, drawn = _as_pixels(image), _as_pixels(ground)
+            wp.launch(_sample_three_bytes, cells, inputs=[flat, *found], outputs=[drawn], device=self.device)
+        else:
+            flat, drawn = (array.reshape((-1, self.channels)) for array in (image, ground))
+            rounding = 0.5 if self.dtype == wp.uint8 else 0.0
+            wp.launch(_sample, cells, inputs=[flat, *found, rounding], outputs=[drawn], device=self.device)
+
+
+def _as_pixels(image: wp.array) -> wp.array:
+    """A view of an image of three bytes a pixel as an array of pixels."""
+    return wp.array(ptr=image.ptr, dtype=_Bytes, shape=image.shape[0] * image.shape[1], device=image.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +290,7 @@ def inverse_perspective(
     camera = camera_model(np.linalg.inv(pose), intrinsics, distortion)
     plan = plan_for(
         InversePerspective,
+        image_size=(picture.shape[1], picture.shape[0]),
         bev_range=tuple(float(limit) for limit in bev_range),
         shape=tuple(int(length) for length in shape),
         channels=picture.shape[2],
@@ -215,17 +298,17 @@ def inverse_perspective(
         dtype=picture.dtype,
         device=family.device,
     )
+    # Cameras and planes seldom move: the pixels found last time mostly do.
+    drawn_for = repr((pose.tolist(), np.asarray(intrinsics).tolist(), None if distortion is None else [*distortion]))
+    if drawn_for != plan._drawn_for:
+        plan.set_camera(camera)
+        object.__setattr__(plan, "_drawn_for", drawn_for)
     flat = len(image.shape) == 2
     if family.device != DEFAULT_DEVICE:
-        plan.launch(picture, camera)
+        plan.launch(picture)
         ground = plan.ground.reshape(plan.shape) if flat else plan.ground
         return GroundImage(give(ground, family), give(plan.seen, family))
     host = np.empty(plan.ground.shape, wp.dtype_to_numpy(plan.dtype))
-    seen = np.empty(plan.shape, bool)
-    arrays = [
-        wp.array(host, dtype=plan.dtype, copy=False, device=DEFAULT_DEVICE),
-        wp.array(seen, dtype=wp.bool, copy=False, device=DEFAULT_DEVICE),
-    ]
-    plan._sample_into(*arrays, picture, camera)
+    plan._sample_into(wp.array(host, dtype=plan.dtype, copy=False, device=DEFAULT_DEVICE), picture)
     del owner
-    return GroundImage(adopt(host.reshape(plan.shape) if flat else host, family), adopt(seen, family))
+    return GroundImage(adopt(host.reshape(plan.shape) if flat else host, family), give(plan.seen, family))

@@ -456,6 +456,8 @@ class StatisticalOutliers:
         keep("_tree", tree)
         keep("_lanes", lanes)
         room = max(self.neighbors + 4 * int(LEAF), (2 * int(_WINDOW) + 2) * int(LEAF))
+        if room * lanes > 2**31 - 1:
+            raise ValueError(f"neighbors {self.neighbors} of capacity {self.capacity} points are too many for one plan")
         keep("_room", room)
         keep("_nearest", wp.zeros(room * lanes, dtype=wp.float32, device=device))
         keep("_filled", wp.zeros(lanes, dtype=wp.int32, device=device))

@@ -111,14 +111,38 @@ def test_arrays_of_other_families():
 
 
 def test_the_plan(device):
-    image, pose = picture(3, np.uint8), rig()
-    plan = InversePerspective(bev_range=RANGE, shape=SHAPE, device=device)
-    plan.launch(wp.array(image, dtype=wp.uint8, device=device), camera_model(np.linalg.inv(pose), K))
-    expected = inverse_perspective(image, K, pose, RANGE, SHAPE)
-    assert np.abs(plan.ground.numpy().astype(int) - expected.image).max() <= 1
-    assert np.array_equal(plan.seen.numpy(), expected.seen)
+    plan = InversePerspective(image_size=SIZE, bev_range=RANGE, shape=SHAPE, device=device)
+    image = picture(3, np.uint8)
+    for pose in (rig(), rig(pitch=12.0)):
+        plan.set_camera(camera_model(np.linalg.inv(pose), K))
+        plan.launch(wp.array(image, dtype=wp.uint8, device=device))
+        expected = inverse_perspective(image, K, pose, RANGE, SHAPE)
+        assert np.abs(plan.ground.numpy().astype(int) - expected.image).max() <= 1
+        assert np.array_equal(plan.seen.numpy(), expected.seen)
     with pytest.raises(ValueError, match="image must be contiguous uint8"):
-        plan.launch(wp.array(image.astype(np.float32), device=device), camera_model(np.linalg.inv(pose), K))
+        plan.launch(wp.array(image.astype(np.float32), device=device))
+
+
+def test_a_camera_that_has_moved_is_noticed():
+    image = picture(3, np.uint8)
+    first = inverse_perspective(image, K, rig(), RANGE, SHAPE).image
+    assert not np.array_equal(inverse_perspective(image, K, rig(pitch=6.0), RANGE, SHAPE).image, first)
+    assert not np.array_equal(inverse_perspective(image, K, rig(), RANGE, SHAPE, distortion=LENS).image, first)
+    assert np.array_equal(inverse_perspective(image, K, rig(), RANGE, SHAPE).image, first)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 9, 3), (9, 1, 1), (2, 2, 4)])
+def test_images_of_few_pixels(shape):
+    """A camera straight above, one pixel a metre: the ground is the image itself, turned."""
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    down = np.eye(4)
+    down[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]  # image rows towards -x, columns towards -y
+    down[2, 3] = 2.0
+    height, width = shape[:2]
+    k = np.array([[2.0, 0, 0], [0, 2.0, 0], [0, 0, 1]])
+    ground = inverse_perspective(image, k, down, (0.5 - height, 0.5 - width, 0.5, 0.5), (height, width))
+    assert ground.seen.all()
+    assert np.array_equal(ground.image, image[::-1, ::-1])
 
 
 @pytest.mark.parametrize(

@@ -144,6 +144,11 @@ def test_many_points_in_one_place():
     assert_statistics(line, 4, 1.0)
 
 
+def test_many_neighbours():
+    for neighbors in (100, 333, 599, 600, 1024):
+        assert_statistics(cloud(600, 9), neighbors, 1.0)
+
+
 def test_few_points():
     assert radius_outliers(np.zeros((0, 3), np.float32), 1.0).shape == (0,)
     assert statistical_outliers(np.zeros((0, 3), np.float32)).shape == (0,)
