@@ -97,14 +97,43 @@ def _row_of(
 
 
 @wp.kernel
-def _find_nearest(
+def _find_rows(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     ring_in: wp.array(dtype=wp.uint16),
     count_in: wp.array(dtype=wp.int32),
-    edges_in: wp.array(dtype=wp.vec2d),
     sines_in: wp.array(dtype=wp.float64),
     row_of_bin_in: wp.array(dtype=wp.int32),
+    view: _View,
+    # out
+    row_out: wp.array(dtype=wp.int32),
+    distance_out: wp.array(dtype=wp.float32),
+):
+    """The row of each point, -1 outside the image, and its range. Apart from columns: a CPU is faster so."""
+    i = wp.tid()
+    if i >= count_in[0]:
+        return
+    p = xyz_in[i]
+    distance = wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+    row = int(_OUTSIDE)
+    # Written so that NaN is nowhere.
+    if distance > 0.0 and distance < float(wp.inf):
+        if ring_in:
+            row = view.rows - 1 - int(ring_in[i])
+        else:
+            row = _row_of(p, distance, sines_in, row_of_bin_in, view)
+    row_out[i] = wp.where(row < view.rows, row, _OUTSIDE)
+    distance_out[i] = distance
+
+
+@wp.kernel
+def _find_nearest(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    row_in: wp.array(dtype=wp.int32),
+    distance_in: wp.array(dtype=wp.float32),
+    edges_in: wp.array(dtype=wp.vec2d),
     view: _View,
     # in out: `_EMPTY` where there is none
     nearest: wp.array(dtype=wp.int64),
@@ -113,21 +142,13 @@ def _find_nearest(
     i = wp.tid()
     if i >= count_in[0]:
         return
+    row = row_in[i]
+    if row <= _OUTSIDE:
+        return
     p = xyz_in[i]
-    distance = wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-    # Written so that NaN is nowhere.
-    if not (distance > 0.0 and distance < float(wp.inf)):
-        return
-    row = int(0)
-    if ring_in:
-        row = view.rows - 1 - int(ring_in[i])
-    else:
-        row = _row_of(p, distance, sines_in, row_of_bin_in, view)
-    if row < 0 or row >= view.rows:
-        return
     pixel = row * view.columns + _column_of(p[0], p[1], edges_in, view)
     # The bits of a positive float are in the order of its value.
-    wp.atomic_min(nearest, pixel, (wp.int64(wp.cast(distance, wp.int32)) << _INDEX_BITS) | wp.int64(i))
+    wp.atomic_min(nearest, pixel, (wp.int64(wp.cast(distance_in[i], wp.int32)) << _INDEX_BITS) | wp.int64(i))
 
 
 @wp.kernel
@@ -208,6 +229,8 @@ class RangeProjection:
         keep("_edges", wp.array(_column_edges(columns), dtype=wp.vec2d, device=device))
         keep("_sines", wp.array(sines, dtype=wp.float64, device=device))
         keep("_row_of_bin", wp.array(row_of_bin, dtype=wp.int32, device=device))
+        keep("_row", wp.zeros(self.capacity, dtype=wp.int32, device=device))
+        keep("_distance", wp.zeros(self.capacity, dtype=wp.float32, device=device))
         keep("_nearest", wp.full(rows * columns, 2**63 - 1, dtype=wp.int64, device=device))
         keep("channels", wp.zeros((5, rows, columns), dtype=wp.float32, device=device))
         keep("index", wp.full((rows, columns), -1, dtype=wp.int32, device=device))
@@ -261,9 +284,16 @@ class RangeProjection:
         if ring is not None and (ring.shape[0] < n or ring.dtype != wp.uint16):
             raise ValueError(f"ring must be uint16 with at least {n} rows, as there are points")
         wp.launch(
+            _find_rows,
+            n,
+            inputs=[xyz, ring, count, self._sines, self._row_of_bin, self._view],
+            outputs=[self._row, self._distance],
+            device=self.device,
+        )
+        wp.launch(
             _find_nearest,
             n,
-            inputs=[xyz, ring, count, self._edges, self._sines, self._row_of_bin, self._view],
+            inputs=[xyz, count, self._row, self._distance, self._edges, self._view],
             outputs=[self._nearest],
             device=self.device,
         )
