@@ -1,0 +1,163 @@
+"""The threads of a CPU: the parts of a kernel's work, run at once.
+
+Warp runs a kernel for a CPU on the calling thread, and lets go of Python's lock while it does. A kernel whose parts
+write nothing that another part reads or writes can thus run on all cores: one launch per part. Warp's atomics for a
+CPU are plain reads and writes, so parts must not share what they count in either.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import Any
+
+import warp as wp
+
+from .device import DEFAULT_DEVICE
+
+__all__ = ["launch_parts", "run_together", "set_thread_count", "thread_count"]
+
+_MOST = 8  # more gain little: memory is the limit by then
+
+
+def _cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _count_from_environment() -> int:
+    text = os.environ.get("WARPLOOM_THREADS", "")
+    if not text:
+        return min(_cores(), _MOST)
+    if not text.isdecimal() or int(text) < 1:
+        raise ValueError(f"WARPLOOM_THREADS must be a number of threads from 1, not {text!r}")
+    return int(text)
+
+
+class _Job:
+    """A call that whoever comes first runs: a thread of the crew, or the one that waits for it."""
+
+    def __init__(self, call: Callable[[], Any]):
+        self._call = call
+        self._unclaimed = threading.Lock()
+        self._running = threading.Lock()
+        self._running.acquire()
+        self._error: BaseException | None = None
+
+    def run_if_unclaimed(self) -> None:
+        if not self._unclaimed.acquire(blocking=False):
+            return
+        try:
+            self._call()
+        except BaseException as error:  # handed on to the thread that waits
+            self._error = error
+        finally:
+            self._running.release()
+
+    def wait(self) -> None:
+        self.run_if_unclaimed()
+        self._running.acquire()
+        if self._error is not None:
+            raise self._error
+
+
+class _Crew:
+    """Threads that take jobs from one queue; they are started when first needed and end with the process."""
+
+    def __init__(self):
+        self._jobs: SimpleQueue[_Job] = SimpleQueue()
+        self._threads = 0
+        self._growing = threading.Lock()
+
+    def take(self, jobs: Sequence[_Job]) -> None:
+        if self._threads < len(jobs):
+            with self._growing:
+                for number in range(self._threads, len(jobs)):
+                    threading.Thread(target=self._work, name=f"warploom-kernels-{number}", daemon=True).start()
+                    self._threads = number + 1
+        for job in jobs:
+            self._jobs.put(job)
+
+    def _work(self) -> None:
+        while True:
+            self._jobs.get().run_if_unclaimed()
+
+
+_crew = _Crew()
+_thread_count = _count_from_environment()
+
+
+def _forget_threads_of_parent() -> None:
+    """A forked process has none of its parent's threads."""
+    global _crew
+    _crew = _Crew()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_threads_of_parent)
+
+
+def thread_count() -> int:
+    """How many threads a kernel may use on a CPU: `WARPLOOM_THREADS`, else the cores of this process, at most 8."""
+    return _thread_count
+
+
+def set_thread_count(count: int) -> None:
+    """Sets how many threads a kernel may use on a CPU; the results do not depend on it.
+
+    Plans take the number when they are made.
+
+    Raises:
+        ValueError: The number is below 1.
+    """
+    global _thread_count
+    if count < 1:
+        raise ValueError(f"count must be at least 1 thread, not {count}")
+    _thread_count = int(count)
+
+
+def run_together(calls: Sequence[Callable[[], Any]]) -> None:
+    """Runs calls at once, the first on this thread, and returns when all have ended.
+
+    While the CPU's launches are being captured, they run one after the other on this thread.
+    """
+    if len(calls) < 2 or wp.get_device(DEFAULT_DEVICE).is_capturing:
+        for call in calls:
+            call()
+        return
+    jobs = [_Job(call) for call in calls]
+    _crew.take(jobs[1:])
+    failed: BaseException | None = None
+    for job in jobs:  # all, even after one has failed: they write to the caller's memory
+        try:
+            job.wait()
+        except BaseException as error:
+            failed = failed or error
+    if failed is not None:
+        raise failed
+
+
+def launch_parts(kernel: Any, parts: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
+    """Launches a kernel for the CPU once per part, all at once.
+
+    Args:
+        kernel: A Warp kernel whose first two parameters are the part, 0 … parts − 1, and `parts`; it is launched with
+            one thread for each part, and does that part's whole work.
+        parts: How many.
+        inputs: The parameters that follow.
+        outputs: Those that it writes.
+    """
+    if parts == 1 or wp.get_device(DEFAULT_DEVICE).is_capturing:
+        for part in range(parts):
+            wp.launch(kernel, 1, inputs=[part, parts, *inputs], outputs=list(outputs), device=DEFAULT_DEVICE)
+        return
+    # Recorded here, where a module that is not loaded yet is loaded once.
+    commands = [
+        wp.launch(
+            kernel, 1, inputs=[part, parts, *inputs], outputs=list(outputs), device=DEFAULT_DEVICE, record_cmd=True
+        )
+        for part in range(parts)
+    ]
+    run_together([command.launch for command in commands])

@@ -1,0 +1,126 @@
+"""The parts of a kernel's work at once: all of it done, errors handed on, nested and from many threads."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warploom.kernels.threads import launch_parts, run_together, set_thread_count, thread_count
+
+
+@wp.kernel
+def _square_part(
+    part: int,
+    parts: int,
+    # in
+    values_in: wp.array(dtype=wp.int32),
+    # out
+    squares_out: wp.array(dtype=wp.int32),
+):
+    n = values_in.shape[0]
+    for i in range(n * part / parts, n * (part + 1) / parts):
+        squares_out[i] = values_in[i] * values_in[i]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_every_part_is_launched(parts):
+    values = np.arange(1000, dtype=np.int32)
+    squares = wp.zeros(1000, dtype=wp.int32, device="cpu")
+
+    launch_parts(_square_part, parts, [wp.array(values, device="cpu")], [squares])
+
+    np.testing.assert_array_equal(squares.numpy(), values**2)
+
+
+def test_a_capture_records_every_part():
+    values = np.arange(1000, dtype=np.int32)
+    squares = wp.zeros(1000, dtype=wp.int32, device="cpu")
+    given = wp.array(values, device="cpu")
+    launch_parts(_square_part, 3, [given], [squares])
+    with wp.ScopedCapture(device="cpu") as capture:
+        launch_parts(_square_part, 3, [given], [squares])
+    squares.zero_()
+
+    wp.capture_launch(capture.graph)
+
+    np.testing.assert_array_equal(squares.numpy(), values**2)
+
+
+def test_calls_run_at_once():
+    met = threading.Barrier(3, timeout=10)
+
+    run_together([met.wait] * 3)
+
+    assert not met.broken
+
+
+def test_an_error_is_handed_on_after_all_calls_have_ended():
+    ended = []
+
+    def fail():
+        raise OSError("no such part")
+
+    with pytest.raises(OSError, match="no such part"):
+        run_together([lambda: ended.append(0), fail, lambda: ended.append(2)])
+
+    assert sorted(ended) == [0, 2]
+
+
+def test_calls_may_run_calls_of_their_own_and_come_from_many_threads():
+    done = []
+
+    def work():
+        run_together([lambda: run_together([lambda: done.append(1)] * 4)] * 4)
+
+    callers = [threading.Thread(target=work) for _ in range(8)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(timeout=30)
+
+    assert len(done) == 8 * 16
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_gets_threads_of_its_own():
+    run_together([lambda: None] * 2)
+    met = threading.Barrier(2, timeout=10)
+    child = os.fork()
+    if child == 0:
+        try:
+            run_together([met.wait] * 2)
+            os._exit(0)
+        except BaseException:
+            os._exit(1)
+
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_the_thread_count_can_be_set():
+    before = thread_count()
+    try:
+        set_thread_count(3)
+        assert thread_count() == 3
+        with pytest.raises(ValueError, match="count must be at least 1 thread, not 0"):
+            set_thread_count(0)
+    finally:
+        set_thread_count(before)
+
+
+@pytest.mark.parametrize(("text", "expected"), [("3", "3"), ("none", "must be a number of threads from 1, not 'none'")])
+def test_the_environment_sets_the_thread_count(text, expected):
+    ran = subprocess.run(
+        [sys.executable, "-c", "from warploom.kernels.threads import thread_count; print(thread_count())"],
+        env={**os.environ, "WARPLOOM_THREADS": text},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert expected in ran.stdout + ran.stderr
