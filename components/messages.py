@@ -8,12 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..datamesh.messages import message
 from ..models.classes import CLASSES
 from ..models.detections import Detections
 
 __all__ = ["DetectedObjects", "Obstacle", "Obstacles", "PointLabels", "SensorFrame", "Truth"]
 
+message("warploom.Detections")(Detections)
 
+
+@message("warploom.Truth")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Truth:
     """What is really there in one frame, as a simulator or the labels of a data set tell it."""
@@ -37,6 +41,7 @@ class Truth:
     """True where a point counts for the ground score, shape (n,), bool; None where all do."""
 
 
+@message("warploom.SensorFrame")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SensorFrame:
     """One sweep of the LiDAR as a source gives it, on the host."""
@@ -60,6 +65,7 @@ class SensorFrame:
     truth: Truth | None = None
 
 
+@message("warploom.DetectedObjects")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DetectedObjects:
     """The boxes found in one frame, before tracking."""
@@ -71,6 +77,7 @@ class DetectedObjects:
     """Inputs that this frame had to do without."""
 
 
+@message("warploom.PointLabels")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PointLabels:
     """What perception says of each point of a LiDAR frame, in the order of `SensorFrame.points`."""
@@ -95,6 +102,7 @@ class PointLabels:
         )
 
 
+@message("warploom.Obstacle")
 class Obstacle(NamedTuple):
     """One object of a frame."""
 
@@ -112,6 +120,7 @@ class Obstacle(NamedTuple):
     """`foreground`: a known class; `background`: a cluster of points."""
 
 
+@message("warploom.Obstacles")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Obstacles:
     """The objects around the vehicle in one frame: the output of perception."""

@@ -1,0 +1,345 @@
+"""The lossless binary form of messages: what is decoded equals what was encoded, to the bit of every float.
+
+A value is one byte that says its kind, then its content, little-endian:
+
+    N None · T True · F False · i int (8 bytes) · I int (length, two's complement) · f float (8 bytes) · s str · b bytes
+    a array (dtype, number of dimensions, shape, bytes in C order) · n NumPy scalar (dtype, bytes)
+    t tuple · l list · d dict (count, then the values, or keys and values in their order)
+    m message: the name of its type, count of fields, then name and value of each
+
+Lengths and counts are 4 bytes, the sizes of arrays 8. The same value makes the same bytes, so that bytes, or a hash of
+them, can be compared in place of values. Nothing is ever executed: only registered types are made, by their fields.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+__all__ = ["Decoder", "MessageType", "decode", "encode", "message", "message_type"]
+
+T = TypeVar("T", bound=type)
+
+_DEEPEST = 64
+_INT = struct.Struct("<q")
+_FLOAT = struct.Struct("<d")
+_COUNT = struct.Struct("<I")
+_SIZE = struct.Struct("<Q")
+
+
+@dataclass(frozen=True)
+class MessageType:
+    """A type that can be encoded, and made again from its fields."""
+
+    cls: type
+    name: str
+    """How recordings call it; it must stay the same when the code moves."""
+    fields: tuple[str, ...]
+    optional: frozenset[str]
+    """Fields with a default, which an older recording may lack."""
+    make: Callable[[dict[str, Any]], Any]
+
+    def schema(self) -> str:
+        """The fields and their types as JSON, for people and for other readers."""
+        hints = getattr(self.cls, "__annotations__", {})
+        fields = {name: hints[name] if isinstance(hints.get(name), str) else "" for name in self.fields}
+        return json.dumps({"name": self.name, "fields": fields})
+
+
+_by_class: dict[type, MessageType] = {}
+_by_name: dict[str, MessageType] = {}
+
+
+def message(name: str) -> Callable[[T], T]:
+    """Registers a dataclass, a named tuple or an enumeration as a message, under a name of its own.
+
+        @message("my_robot.Battery")
+        @dataclass(frozen=True)
+        class Battery:
+            volts: float
+
+    Raises:
+        TypeError: The class is none of these, or has a field that its constructor does not take.
+        ValueError: The name stands for another class already.
+    """
+
+    def register(cls: T) -> T:
+        known = _by_name.get(name)
+        if known is not None and known.cls is not cls and known.cls.__qualname__ != cls.__qualname__:
+            raise ValueError(f"the message name {name!r} stands for {known.cls.__qualname__} already")
+        kind = _describe(cls, name)
+        _by_class[cls], _by_name[name] = kind, kind
+        return cls
+
+    return register
+
+
+def message_type(cls: type) -> MessageType | None:
+    """What is known of a class; None where it is not registered."""
+    return _by_class.get(cls)
+
+
+def _describe(cls: type, name: str) -> MessageType:
+    if dataclasses.is_dataclass(cls):
+        fields = dataclasses.fields(cls)
+        hidden = [field.name for field in fields if not field.init]
+        if hidden:
+            raise TypeError(f"{cls.__name__} cannot be a message: its constructor does not take {', '.join(hidden)}")
+        missing = dataclasses.MISSING
+        optional = [f.name for f in fields if f.default is not missing or f.default_factory is not missing]
+        return MessageType(
+            cls, name, tuple(field.name for field in fields), frozenset(optional), lambda values: cls(**values)
+        )
+    if issubclass(cls, enum.Enum):
+        return MessageType(cls, name, ("value",), frozenset(), lambda values: cls(values["value"]))
+    if issubclass(cls, tuple) and hasattr(cls, "_fields"):
+        optional = frozenset(getattr(cls, "_field_defaults", {}))
+        return MessageType(cls, name, tuple(cls._fields), optional, lambda values: cls(**values))
+    raise TypeError(f"{cls.__name__} is neither a dataclass nor a named tuple nor an enumeration: it has no fields")
+
+
+def encode(value: Any) -> bytes:
+    """The bytes of a value.
+
+    Args:
+        value: None, bool, int, float, str, bytes, arrays and scalars of NumPy, tuples, lists, dicts, and messages.
+
+    Raises:
+        TypeError: It holds something else; says where, and of which type.
+    """
+    parts: list[Any] = []
+    _put(value, parts, 0)
+    return b"".join(parts)
+
+
+def _put(value: Any, parts: list[Any], depth: int) -> None:
+    if depth > _DEEPEST:
+        raise TypeError(f"it is nested deeper than {_DEEPEST} levels")
+    cls = type(value)
+    if cls is np.ndarray:
+        _put_array(value, parts)
+    elif value is None:
+        parts.append(b"N")
+    elif cls is bool:
+        parts.append(b"T" if value else b"F")
+    elif cls is int:
+        if -(1 << 63) <= value < 1 << 63:
+            parts.append(b"i" + _INT.pack(value))
+        else:
+            _put_bytes(b"I", value.to_bytes(value.bit_length() // 8 + 1, "little", signed=True), parts)
+    elif cls is float:
+        parts.append(b"f" + _FLOAT.pack(value))
+    elif cls is str:
+        _put_bytes(b"s", value.encode("utf-8", "surrogatepass"), parts)
+    elif cls is bytes:
+        _put_bytes(b"b", value, parts)
+    elif cls is tuple or cls is list:
+        parts.append((b"t" if cls is tuple else b"l") + _COUNT.pack(len(value)))
+        for index, item in enumerate(value):
+            _put_at(f"[{index}]", item, parts, depth)
+    elif cls is dict:
+        parts.append(b"d" + _COUNT.pack(len(value)))
+        for key, item in value.items():
+            _put_at("a key", key, parts, depth)
+            _put_at(f"[{key!r}]", item, parts, depth)
+    elif (kind := _by_class.get(cls)) is not None:
+        _put_bytes(b"m", kind.name.encode(), parts)
+        parts.append(_COUNT.pack(len(kind.fields)))
+        for name in kind.fields:
+            _put_bytes(b"", name.encode(), parts)
+            _put_at(f"{cls.__name__}.{name}", getattr(value, name), parts, depth)
+    elif isinstance(value, np.generic) and not value.dtype.hasobject:
+        parts.append(b"n")
+        _put(_dtype_text(value.dtype), parts, depth + 1)
+        _put_bytes(b"", value.tobytes(), parts)
+    else:
+        raise TypeError(
+            f"{cls.__module__}.{cls.__qualname__} is not a message: register it with warploom.datamesh.messages.message"
+        )
+
+
+def _put_at(place: str, value: Any, parts: list[Any], depth: int) -> None:
+    try:
+        _put(value, parts, depth + 1)
+    except TypeError as error:
+        raise TypeError(f"{place}: {error}") from None
+
+
+def _put_bytes(kind: bytes, content: bytes, parts: list[Any]) -> None:
+    if len(content) >= 1 << 32:
+        raise TypeError(f"{len(content)} bytes in one text: at most 4 GiB")
+    parts.append(kind + _COUNT.pack(len(content)))
+    parts.append(content)
+
+
+def _put_array(array: np.ndarray, parts: list[Any]) -> None:
+    if array.dtype.hasobject:
+        raise TypeError(f"an array of {array.dtype}: Python objects have no bytes of their own")
+    parts.append(b"a")
+    _put(_dtype_text(array.dtype), parts, 0)
+    parts.append(_COUNT.pack(array.ndim) + b"".join(_SIZE.pack(size) for size in array.shape))
+    # A view of the memory: it is copied once, when the parts are joined. Dates have no buffer, bytes have.
+    parts.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.size else b"")
+
+
+def _dtype_text(dtype: np.dtype) -> Any:
+    """A dtype as plain values: a text, or for a record the list of its fields."""
+    described = np.lib.format.dtype_to_descr(dtype)
+    return described if isinstance(described, str) else [list(map(_plain, field)) for field in described]
+
+
+def _plain(part: Any) -> Any:
+    return [_plain(inner) for inner in part] if isinstance(part, (tuple, list)) else part
+
+
+def _dtype_of(text: Any) -> np.dtype:
+    try:
+        dtype = np.lib.format.descr_to_dtype(text if isinstance(text, str) else _fields_of(text))
+    except Exception as error:
+        raise ValueError(f"{text!r} is no type of an array") from error
+    if dtype.hasobject or dtype.itemsize == 0:
+        raise ValueError(f"{text!r} is no type of an array that has bytes")
+    return dtype
+
+
+def _fields_of(fields: Any) -> list[tuple]:
+    result = []
+    for field in fields:
+        name, kind, *shape = field
+        kind = kind if isinstance(kind, str) else _fields_of(kind)
+        result.append((tuple(name) if isinstance(name, list) else name, kind, *(tuple(size) for size in shape)))
+    return result
+
+
+def decode(data: bytes | memoryview) -> Any:
+    """The value that was encoded; arrays are copies with memory of their own.
+
+    Raises:
+        ValueError: The bytes are truncated or damaged, or hold a message of a type that is not registered.
+    """
+    decoder = Decoder(data)
+    value = decoder.value()
+    if decoder.position != len(decoder.data):
+        raise ValueError(f"{len(decoder.data) - decoder.position} bytes are left behind the value")
+    return value
+
+
+class Decoder:
+    """Reads values one after the other; never beyond the end, and never more than the bytes can hold."""
+
+    def __init__(self, data: bytes | memoryview) -> None:
+        self.data = memoryview(data).cast("B")
+        self.position = 0
+
+    def _take(self, size: int) -> memoryview:
+        if size > len(self.data) - self.position:
+            raise ValueError(f"truncated: {size} bytes expected at byte {self.position} of {len(self.data)}")
+        self.position += size
+        return self.data[self.position - size : self.position]
+
+    def _count(self) -> int:
+        return _COUNT.unpack(self._take(4))[0]
+
+    def _bytes(self) -> bytes:
+        return bytes(self._take(self._count()))
+
+    def _text(self) -> str:
+        return self._bytes().decode("utf-8", "surrogatepass")
+
+    def value(self, depth: int = 0) -> Any:
+        """The next value.
+
+        Raises:
+            ValueError: As for `decode`.
+        """
+        if depth > _DEEPEST:
+            raise ValueError(f"nested deeper than {_DEEPEST} levels")
+        place = self.position
+        kind = bytes(self._take(1))
+        read = _READERS.get(kind)
+        if read is None:
+            raise ValueError(f"no kind of value is called {kind!r}, at byte {place}")
+        return read(self, depth + 1)
+
+    def _items(self, depth: int) -> list[Any]:
+        return [self.value(depth) for _ in range(self._within(self._count()))]
+
+    def _within(self, count: int) -> int:
+        """A count of things, each of which takes at least a byte."""
+        if count > len(self.data) - self.position:
+            raise ValueError(f"truncated: {count} values expected in {len(self.data) - self.position} bytes")
+        return count
+
+    def _dict(self, depth: int) -> dict[Any, Any]:
+        result = {}
+        for _ in range(self._within(self._count())):
+            key = self.value(depth)
+            try:
+                hash(key)
+            except TypeError as error:
+                raise ValueError(f"{type(key).__name__} cannot be a key") from error
+            result[key] = self.value(depth)
+        return result
+
+    def _array(self, depth: int) -> np.ndarray:
+        dtype = _dtype_of(self.value(depth))
+        dimensions = self._count()
+        if dimensions > 32:
+            raise ValueError(f"an array of {dimensions} dimensions")
+        shape = tuple(_SIZE.unpack(self._take(8))[0] for _ in range(dimensions))
+        size = math.prod(shape)
+        data = self._take(size * dtype.itemsize)
+        if size == 0 and max(shape) >= 1 << 62:
+            raise ValueError(f"an array of shape {shape}")
+        return np.frombuffer(bytes(data), dtype).reshape(shape).copy()
+
+    def _scalar(self, depth: int) -> Any:
+        dtype = _dtype_of(self.value(depth))
+        data = self._bytes()
+        if len(data) != dtype.itemsize:
+            raise ValueError(f"{len(data)} bytes for one {dtype}")
+        return np.frombuffer(data, dtype)[0]
+
+    def _message(self, depth: int) -> Any:
+        name = self._text()
+        values = {}
+        for _ in range(self._within(self._count())):
+            field = self._text()
+            values[field] = self.value(depth)
+        kind = _by_name.get(name)
+        if kind is None:
+            raise ValueError(f"no type is registered as message {name!r}: import the module that defines it")
+        missing = [field for field in kind.fields if field not in values and field not in kind.optional]
+        unknown = [field for field in values if field not in kind.fields]
+        if missing or unknown:
+            raise ValueError(f"message {name!r}: fields missing: {missing or 'none'}; unknown: {unknown or 'none'}")
+        try:
+            return kind.make(values)
+        except Exception as error:
+            raise ValueError(f"message {name!r} cannot be made: {type(error).__name__}: {error}") from error
+
+
+_READERS: Mapping[bytes, Callable[[Decoder, int], Any]] = {
+    b"N": lambda decoder, depth: None,
+    b"T": lambda decoder, depth: True,
+    b"F": lambda decoder, depth: False,
+    b"i": lambda decoder, depth: _INT.unpack(decoder._take(8))[0],
+    b"I": lambda decoder, depth: int.from_bytes(decoder._bytes(), "little", signed=True),
+    b"f": lambda decoder, depth: _FLOAT.unpack(decoder._take(8))[0],
+    b"s": lambda decoder, depth: decoder._text(),
+    b"b": lambda decoder, depth: decoder._bytes(),
+    b"t": lambda decoder, depth: tuple(decoder._items(depth)),
+    b"l": Decoder._items,
+    b"d": Decoder._dict,
+    b"a": Decoder._array,
+    b"n": Decoder._scalar,
+    b"m": Decoder._message,
+}
