@@ -5,7 +5,7 @@ import pytest
 
 from warploom.bench.bench_kernels import BEV_RANGE, BEV_SHAPE, PILLARS, RADIUS
 from warploom.bench.contest import Contender, peer, processors
-from warploom.bench.scans import SCANS
+from warploom.bench.scans import SIZES
 from warploom.kernels.bev import bev
 from warploom.kernels.cluster import cluster
 from warploom.kernels.ground import segment_ground
@@ -34,7 +34,7 @@ def same_voxels(ours, theirs):
     return f"{len(ours)} voxels, {'equal to the bit' if equal else 'not equal'}"
 
 
-@pytest.mark.parametrize("scan", SCANS)
+@pytest.mark.parametrize("scan", SIZES)
 def bench_voxelize(contest, scan):
     points = contest.cloud(scan)
     run(contest, "voxelize", scan, points, lambda **options: voxelize(points, **PILLARS, **options), same_voxels)
@@ -46,7 +46,7 @@ def same_ground(ours, theirs):
     return f"{100 * alike:.2f} % of the points alike, heights within {1e3 * furthest:.3f} mm"
 
 
-@pytest.mark.parametrize("scan", SCANS)
+@pytest.mark.parametrize("scan", SIZES)
 def bench_segment_ground(contest, scan):
     points = contest.cloud(scan)
     run(contest, "segment_ground", scan, points, lambda **options: segment_ground(points, **options), same_ground)
@@ -56,7 +56,7 @@ def same_labels(ours, theirs):
     return f"{ours.max() + 1} clusters, {'the same labels' if np.array_equal(ours, theirs) else 'not the same'}"
 
 
-@pytest.mark.parametrize("scan", SCANS)
+@pytest.mark.parametrize("scan", SIZES)
 def bench_cluster(contest, scan):
     whole = contest.cloud(scan)
     points = np.ascontiguousarray(whole[~segment_ground(whole).mask])
@@ -74,7 +74,7 @@ def same_maps(ours, theirs):
     return "equal to the bit" if np.array_equal(ours, theirs) else "not equal"
 
 
-@pytest.mark.parametrize("scan", SCANS)
+@pytest.mark.parametrize("scan", SIZES)
 def bench_bev(contest, scan):
     points = contest.cloud(scan)
     run(contest, "bev", scan, points, lambda **options: bev(points, BEV_RANGE, BEV_SHAPE, **options), same_maps)

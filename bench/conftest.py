@@ -7,8 +7,20 @@ import pytest
 
 from warploom.bench.contest import Contest
 from warploom.bench.scans import Scans
+from warploom.kernels.threads import thread_count
 
-_PEERS = ("spconv", "small-gicp", "kiss-icp", "open3d", "pypatchworkpp", "scipy", "scikit-learn", "shapely")
+_PEERS = (
+    "spconv",
+    "small-gicp",
+    "kiss-icp",
+    "open3d",
+    "pypatchworkpp",
+    "scipy",
+    "scikit-learn",
+    "shapely",
+    "opencv-python-headless",
+    "taichi",
+)
 _skipped: dict[str, str] = {}
 
 
@@ -35,6 +47,7 @@ def pytest_benchmark_update_json(config, benchmarks, output_json):
     from warploom.components.machine import describe_machine
 
     machine = describe_machine()
+    machine["threads"] = thread_count()
     for package in _PEERS:
         try:
             machine["versions"][package] = importlib.metadata.version(package)

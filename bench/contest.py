@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,11 +15,27 @@ import pytest
 import warp as wp
 
 from ..kernels.device import DEFAULT_DEVICE, resolve_device
+from ..kernels.threads import set_thread_count, thread_count
 from .scans import Scans
 
-__all__ = ["Contender", "Contest", "SelfTimed", "contenders", "on_device", "peer", "processors", "record_figure"]
+__all__ = [
+    "ONE_THREAD",
+    "OURS",
+    "PLAN",
+    "Contender",
+    "Contest",
+    "SelfTimed",
+    "contenders",
+    "on_device",
+    "peer",
+    "processors",
+    "record_figure",
+    "record_score",
+]
 
-OURS, PLAN = "warploom", "warploom plan"
+OURS, PLAN, ONE_THREAD = "warploom", "warploom plan", "warploom, 1 thread"
+_SLOW = 0.1  # [s] a call, from which three rounds must do
+_WATCHED = 0.03  # [s] that the processor is watched for how many cores are busy
 
 
 @dataclass(frozen=True)
@@ -25,9 +43,14 @@ class Contender:
     """Who is timed, and where it computes."""
 
     who: str
-    """`warploom` (the function), `warploom plan` (its preallocated face), or a peer's name."""
+    """`warploom` (the function), `warploom plan` (its preallocated face), `warploom, 1 thread`, or a peer's name."""
     device: str = DEFAULT_DEVICE
     """A Warp device; peers compute on the CPU."""
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is no peer."""
+        return self.who in (OURS, PLAN, ONE_THREAD)
 
 
 @dataclass
@@ -48,9 +71,15 @@ class SelfTimed:
         return result
 
 
-def contenders(*peers: str) -> list[Any]:
-    """Parameters of a benchmark: function and plan on each device, then the peers."""
-    ours = [pytest.param(Contender(who, DEFAULT_DEVICE), id=f"{who} cpu") for who in (OURS, PLAN)]
+def contenders(*peers: str, one_thread: bool = False) -> list[Any]:
+    """Parameters of a benchmark: function and plan on each device, then the peers.
+
+    Args:
+        *peers: Their names.
+        one_thread: Whether the function is to be timed with one CPU thread too.
+    """
+    faces = (OURS, PLAN, ONE_THREAD) if one_thread else (OURS, PLAN)
+    ours = [pytest.param(Contender(who, DEFAULT_DEVICE), id=f"{who} cpu") for who in faces]
     ours += [pytest.param(Contender(who, "cuda:0"), id=f"{who} cuda:0", marks=pytest.mark.cuda) for who in (OURS, PLAN)]
     return ours + [pytest.param(Contender(who), id=who) for who in peers]
 
@@ -94,6 +123,7 @@ class Contest:
         score: Callable[[Any], str] | None = None,
         goals: Mapping[str, float] | None = None,
         threads: Mapping[str, int] | None = None,
+        how: str = "",
     ) -> None:
         """Times one contender.
 
@@ -107,39 +137,87 @@ class Contest:
             score: Says how right a result is.
             goals: By peer the share of its time that ours is to take.
             threads: By peer how many threads it uses, where that is more than one.
+            how: What the kernel was asked for, its sizes and ranges, for people; the same for all contenders.
         """
         who, device = contender.who, contender.device
+        self._benchmark.extra_info["how"] = how
         if device != DEFAULT_DEVICE:
             if not wp.is_cuda_available():
                 pytest.skip("no CUDA device here")
             resolve_device(device)
+        if who == ONE_THREAD:
+            if thread_count() == 1:
+                pytest.skip("one CPU thread is all that there is")
+            with _one_thread():
+                self._run(contender, calls[OURS], kernel, on, size, [], 1)
+            return
         call = calls[who](device)
         result = call()
-        accuracy = []
-        if score is not None:
-            accuracy.append(score(result))
-        is_peer = who not in (OURS, PLAN)
-        if agree is not None and is_peer:
+        accuracy = [score(result)] if score is not None else []
+        if agree is not None and not contender.is_ours:
             accuracy.append(agree(calls[OURS](DEFAULT_DEVICE)(), result))
+        if not contender.is_ours:
+            self._benchmark.extra_info["goal"] = (goals or {}).get(who)
+        used = thread_count() if contender.is_ours else (threads or {}).get(who, 1)
+        self._run(contender, lambda _: call, kernel, on, size, accuracy, used)
+
+    def _run(
+        self,
+        contender: Contender,
+        prepare: Callable[[str], Callable[[], Any]],
+        kernel: str,
+        on: str,
+        size: int,
+        accuracy: list[str],
+        threads: int,
+    ) -> None:
+        device = contender.device
+        call = prepare(device)
+        timed = call if device == DEFAULT_DEVICE else _finished(call, device)
+        timed()
+        start = time.perf_counter()
+        timed()
+        once = time.perf_counter() - start
         info = self._benchmark.extra_info
         info.update(
             kernel=kernel,
             on=on,
             size=size,
-            who=who,
+            who=contender.who,
             device=device,
-            threads=(threads or {}).get(who, 1),
+            threads=threads,
             accuracy="; ".join(text for text in accuracy if text),
         )
-        if is_peer:
-            info["goal"] = (goals or {}).get(who)
         self._benchmark.group = f"{kernel}, {on}"
-        if device == DEFAULT_DEVICE:
-            self._benchmark(call)
+        if isinstance(call, SelfTimed):
+            call.taken.clear()
+        if once < _SLOW:
+            self._benchmark(timed)
         else:
-            self._benchmark(_finished(call, device))
+            self._benchmark.pedantic(timed, rounds=3)
         if isinstance(call, SelfTimed):
             info["own_timer_s"] = float(np.median(call.taken))
+        if device == DEFAULT_DEVICE:
+            info["busy_cores"] = _busy_cores(timed, once)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    before = thread_count()
+    set_thread_count(1)
+    try:
+        yield
+    finally:
+        set_thread_count(before)
+
+
+def _busy_cores(call: Callable[[], Any], once: float) -> float:
+    """How many cores a call keeps busy: the processor's time over that of the clock."""
+    repeats = max(1, round(_WATCHED / max(once, 1e-6)))
+    clock, processor = time.perf_counter(), time.process_time()
+    for _ in range(repeats):
+        call()
+    return (time.process_time() - processor) / (time.perf_counter() - clock)
 
 
 def _finished(call: Callable[[], Any], device: str) -> Callable[[], None]:
@@ -179,3 +257,36 @@ def record_figure(
     """
     figures = benchmark.extra_info.setdefault("figures", [])
     figures.append({"name": name, "value": float(value), "unit": unit, "goal": goal, "note": note})
+
+
+def record_score(
+    benchmark: Any,
+    name: str,
+    *,
+    on: str,
+    ours: float,
+    theirs: float | None,
+    peer: str,
+    unit: str,
+    gain: float | None = None,
+    note: str = "",
+    lower_is_better: bool = False,
+) -> None:
+    """Adds how right ours is beside a peer on the same input.
+
+    Args:
+        benchmark: The fixture of pytest-benchmark.
+        name: What it is.
+        on: What both were given.
+        ours: How right ours is.
+        theirs: How right the peer is; None where it gives nothing.
+        peer: The peer's name.
+        unit: Of both.
+        gain: How much higher than the peer's ours is to be, which may be below zero; None where there is no goal.
+        note: How it was taken.
+        lower_is_better: Whether these are errors; the gain is then how much lower.
+    """
+    benchmark.extra_info.setdefault("scores", []).append({
+        "name": name, "on": on, "ours": float(ours), "theirs": None if theirs is None else float(theirs),
+        "peer": peer, "unit": unit, "gain": gain, "note": note, "lower_is_better": lower_is_better,
+    })  # fmt: skip

@@ -9,18 +9,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..models.evaluation.ground import SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, GroundLabels
+from ..models.evaluation.ground import RANGE_IMAGE_32, SEMANTIC_KITTI, SEMANTIC_KITTI_TRAIN, GroundLabels
 from ..models.geometry import KittiCalibration, kitti_poses
 
 if TYPE_CHECKING:
-    from ..models.simulator import SimulatedFrame
+    from ..models.simulator import SimulatedFrame, Simulator
 
-__all__ = ["REAL", "SCANS", "LabelledScan", "Scans", "terrain_mesh"]
+__all__ = ["CITY", "REAL", "SCANS", "SIZES", "LabelledScan", "Scans", "terrain_mesh"]
 
-REAL = "KITTI"
-"""The scan that is real: a full sweep of an HDL-64E, about 124 thousand points."""
+REAL, CITY = "KITTI", "KITTI 00"
+"""The scans that are real, full sweeps of an HDL-64E, 123 and 125 thousand points: an open crossing, and a street
+between houses (the first scans of SemanticKITTI's sequences 08 and 00)."""
 SCANS = ("street 10k", "street 120k", "street 500k", REAL)
 """The clouds: every twelfth point of a simulated sweep of an HDL-64E, a whole one, four of them; a real one."""
+SIZES = ("street 10k", "street 120k", "street 500k", "street 2M", REAL, CITY)
+"""The same, two million points of seventeen sweeps, and the other real one: for the kernels that have goals."""
 
 _SEED = 7
 
@@ -29,6 +32,8 @@ _SEED = 7
 class LabelledScan:
     """A scan whose ground is known."""
 
+    name: str
+    """Of its file."""
     points: np.ndarray
     """x y z [m] and intensity, shape (n, 4), float32."""
     ground: np.ndarray
@@ -53,12 +58,20 @@ class Scans:
     @functools.cached_property
     def street(self) -> list[SimulatedFrame]:
         """Twenty sweeps of an HDL-64E that is driven along a simulated street, 10 a second."""
+        return [self._first_of_street, *(self._simulator.frame(index) for index in range(1, len(self._simulator)))]
+
+    @functools.cached_property
+    def _simulator(self) -> Simulator:
         from ..models.simulator import Simulator
 
-        return list(Simulator(seed=_SEED, duration=2.0))
+        return Simulator(seed=_SEED, duration=2.0)
+
+    @functools.cached_property
+    def _first_of_street(self) -> SimulatedFrame:
+        return self._simulator.frame(0)
 
     def cloud(self, name: str) -> np.ndarray:
-        """The cloud of this name, one of `SCANS`; shape (n, 4), float32.
+        """The cloud of this name, one of `SIZES`; shape (n, 4), float32.
 
         Raises:
             FileNotFoundError: It is the real one, and the real scans are not here.
@@ -68,17 +81,20 @@ class Scans:
         return self._kept[name]
 
     def _make(self, name: str) -> np.ndarray:
-        if name == REAL:
-            return _read_bin(self._folder("semantic_kitti/full") / "08_000000.bin")
-        first = self.street[0]
+        if name in (REAL, CITY):
+            sequence = "08" if name == REAL else "00"
+            return _read_bin(self._folder("semantic_kitti/full") / f"{sequence}_000000.bin")
+        first = self._first_of_street
         if name == "street 10k":
             return first.points[::12]
         if name == "street 120k":
             return first.points
-        if name != "street 500k":
-            raise ValueError(f"name must be one of {', '.join(SCANS)}, not {name!r}")
-        # Half a second of driving apart, all seen from the first sweep's sensor.
-        return np.concatenate([_seen_from(frame, first) for frame in self.street[::5]])
+        # Half or a tenth of a second of driving apart, all seen from the first sweep's sensor.
+        if name == "street 500k":
+            return np.concatenate([_seen_from(frame, first) for frame in self.street[::5]])
+        if name == "street 2M":
+            return np.concatenate([_seen_from(frame, first) for frame in self.street[:17]])[:2_000_000]
+        raise ValueError(f"name must be one of {', '.join(SIZES)}, not {name!r}")
 
     def _folder(self, name: str) -> Path:
         if self._data is None or not (self._data / name).is_dir():
@@ -120,27 +136,51 @@ class Scans:
 
     @functools.cached_property
     def labelled(self) -> dict[str, list[LabelledScan]]:
-        """The scans whose ground is labelled, by set.
+        """The scans whose ground is labelled, by sensor and set.
 
         Raises:
             FileNotFoundError: The real scans are not here.
         """
-        full = self._folder("semantic_kitti/full")
-        images = self._folder("semantic_kitti/range_64x1024")
-        sets: dict[str, list[LabelledScan]] = {"full scans": [], "range images": []}
-        for path in sorted(full.glob("*.bin")):
+        full = []
+        for path in sorted(self._folder("semantic_kitti/full").glob("*.bin")):
             whole, partial = path.with_suffix(".label"), path.with_suffix(".partial_label_u8")
             if whole.exists():
                 labels, meaning = np.fromfile(whole, np.uint32) & 0xFFFF, SEMANTIC_KITTI
             else:
                 labels, meaning = np.fromfile(partial, np.uint8), SEMANTIC_KITTI_TRAIN
-            sets["full scans"].append(_labelled(_read_bin(path), labels, meaning))
-        for path in sorted(images.glob("*.npz")):
+            full.append(_labelled(path.stem, _read_bin(path), labels, meaning))
+        return {
+            "KITTI, 64 beams, full scans": full,
+            "KITTI, 64 beams, range images": self._range_images("semantic_kitti/range_64x1024", SEMANTIC_KITTI_TRAIN),
+            "nuScenes, 32 beams, range images": self._range_images("nuscenes_range_32x1024", RANGE_IMAGE_32),
+            "VLP-32, range images": self._range_images("ika_vlp32_range_32x240", RANGE_IMAGE_32),
+        }
+
+    def _range_images(self, folder: str, meaning: GroundLabels) -> list[LabelledScan]:
+        scans = []
+        for path in sorted(self._folder(folder).glob("*.npz")):
             image = np.load(path)
             seen = image["depth"].ravel() > 0
             points = np.column_stack([image["xyz"].reshape(-1, 3), image["intensity"].ravel()])[seen]
-            sets["range images"].append(_labelled(points, image["label"].ravel()[seen], SEMANTIC_KITTI_TRAIN))
-        return sets
+            scans.append(_labelled(path.stem, points, image["label"].ravel()[seen], meaning))
+        return scans
+
+    def elevations(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Tilted scans of 100,000 points and the ground beneath them: a smooth estimate from labelled points (GndNet).
+
+        Returns:
+            For each scan its points, shape (n, 4), and z of the ground [m] in squares of 1 m, row = x and column = y,
+            both from −50 m, shape (100, 100), float32.
+
+        Raises:
+            FileNotFoundError: The real scans are not here.
+        """
+        scans = sorted(self._folder("gndnet/reduced_velo").glob("*.npy"))
+        # Its rows are y: so the lowest points of the squares are near it, and not otherwise.
+        return [
+            (np.load(scan), np.load(scan.parent.parent / "gnd_labels" / scan.name).T.astype(np.float32))
+            for scan in scans
+        ]
 
 
 def _read_bin(path: Path) -> np.ndarray:
@@ -161,8 +201,8 @@ def _unpack(path: Path) -> np.ndarray:
     return np.column_stack([xyz, file["intensity_x100"] / 100]).astype(np.float32)
 
 
-def _labelled(points: np.ndarray, labels: np.ndarray, meaning: GroundLabels) -> LabelledScan:
-    return LabelledScan(np.ascontiguousarray(points, np.float32), *meaning.masks(labels))
+def _labelled(name: str, points: np.ndarray, labels: np.ndarray, meaning: GroundLabels) -> LabelledScan:
+    return LabelledScan(name, np.ascontiguousarray(points, np.float32), *meaning.masks(labels))
 
 
 def _seen_from(frame: SimulatedFrame, other: SimulatedFrame) -> np.ndarray:

@@ -6,6 +6,8 @@ import threading
 from collections import OrderedDict
 from typing import Any, TypeVar
 
+from .threads import thread_count
+
 __all__ = ["capacity_for", "plan_for"]
 
 Plan = TypeVar("Plan")
@@ -22,7 +24,8 @@ def capacity_for(count: int) -> int:
 def plan_for(plan_class: type[Plan], **configuration: Any) -> Plan:
     """A plan of this class and configuration: this thread's own from an earlier call, or a new one.
 
-    A plan's workspace serves one thread, so each thread keeps its own; the least recently used are let go.
+    A plan's workspace serves one thread, so each thread keeps its own; the least recently used are let go. A plan takes
+    the number of threads that its kernels may use when it is made: another number, another plan.
 
     Args:
         plan_class: The plan's class, a dataclass whose fields are hashable.
@@ -31,7 +34,7 @@ def plan_for(plan_class: type[Plan], **configuration: Any) -> Plan:
     if not hasattr(_plans, "kept"):
         _plans.kept = OrderedDict()
     kept: OrderedDict[tuple, Any] = _plans.kept
-    key = (plan_class, *sorted(configuration.items()))
+    key = (plan_class, thread_count(), *sorted(configuration.items()))
     plan = kept.pop(key, None)
     if plan is None:
         plan = plan_class(**configuration)

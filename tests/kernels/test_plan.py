@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from warploom.kernels.plan import capacity_for, plan_for
+from warploom.kernels.threads import set_thread_count, thread_count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +32,17 @@ def test_each_thread_has_its_own():
     thread.start()
     thread.join()
     assert plans[0] is not plans[1]
+
+
+def test_another_number_of_threads_gives_another_plan():
+    plan = plan_for(Plan, capacity=64)
+    before = thread_count()
+    set_thread_count(before + 1)
+    try:
+        assert plan_for(Plan, capacity=64) is not plan
+    finally:
+        set_thread_count(before)
+    assert plan_for(Plan, capacity=64) is plan
 
 
 def test_the_least_recently_used_is_let_go():
