@@ -299,7 +299,7 @@ class Decoder:
         data = self._take(size * dtype.itemsize)
         if size == 0 and max(shape) >= 1 << 62:
             raise ValueError(f"an array of shape {shape}")
-        return np.frombuffer(bytes(data), dtype).reshape(shape).copy()
+        return np.frombuffer(data, dtype).reshape(shape).copy()
 
     def _scalar(self, depth: int) -> Any:
         dtype = _dtype_of(self.value(depth))

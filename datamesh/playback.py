@@ -1,0 +1,146 @@
+"""Plays a recording into a mesh: at its own pace or any other, from any place, again and again, step by step."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+from .handle import Output
+from .mesh import DataMesh
+from .recording import EventKind, RecordedEvent
+from .recording_reader import Recording
+from .window import CommitPolicy
+
+__all__ = ["Player"]
+
+_log = logging.getLogger(__name__)
+
+
+class Player:
+    """Publishes the commits and settled versions of a recording, in their order.
+
+    Time is that of the versions: with `rate=2` ten seconds between two versions take five. Where the recording entered
+    a new epoch, and each time it starts over, the whole mesh enters one, after `before_epoch` has been called: whoever
+    owns the mesh waits there until nothing of the old epoch is on its way any more.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        mesh: DataMesh,
+        topics: Iterable[str],
+        *,
+        rate: float | None = 1.0,
+        seek: float = 0.0,
+        loops: int | None = 1,
+        before_epoch: Callable[[], None] = lambda: None,
+        on_event: Callable[[RecordedEvent], bool] = lambda event: True,
+    ) -> None:
+        """Prepares, without publishing anything.
+
+        Args:
+            recording: What to play.
+            mesh: Where to.
+            topics: Which of its topics.
+            rate: Speed, > 0; None: as fast as the mesh takes it.
+            seek: Where to begin [s], ≥ 0, from the lowest version of the first epoch.
+            loops: How often to play it; None: until `stop`.
+            before_epoch: Called before each new epoch.
+            on_event: Called before each event is published; False ends the playing, so a caller can step.
+
+        Raises:
+            ValueError: A number makes no sense.
+        """
+        if rate is not None and not rate > 0:
+            raise ValueError(f"rate must be above 0, not {rate}")
+        if not seek >= 0:
+            raise ValueError(f"seek must be at least 0 s, not {seek}")
+        if loops is not None and loops < 1:
+            raise ValueError(f"loops must be at least 1, not {loops}")
+        self._recording = recording
+        self._mesh = mesh
+        self._rate = rate
+        self._seek_ns = round(seek * 1e9)
+        self._loops = loops
+        self._before_epoch = before_epoch
+        self._on_event = on_event
+        self._stopping = threading.Event()
+        self._outputs: dict[str, Output] = {}
+        for topic in topics:
+            self._outputs[topic] = Output()
+            self._outputs[topic].bind(topic, mesh.window(topic))
+        self.published: Counter[str] = Counter()
+        """Commits published, by topic."""
+        self.skipped: Counter[str] = Counter()
+        """Commits that cannot be, as the recording keeps their hash alone or they cannot be decoded."""
+
+    def stop(self) -> None:
+        """Ends the playing, from any thread."""
+        self._stopping.set()
+
+    def play(self) -> None:
+        """Publishes, and returns at the end of the last loop.
+
+        Raises:
+            SourceError: The recording cannot be read any more.
+        """
+        done = 0
+        while (self._loops is None or done < self._loops) and not self._stopping.is_set():
+            if done:
+                self._new_epoch()
+            published = self.published.total()
+            self._once()
+            done += 1
+            if self.published.total() == published:  # an empty recording would loop for ever
+                return
+
+    def _once(self) -> None:
+        first = epoch = beginning = origin = None
+        newest: dict[str, int] = {}
+        start = 0.0
+        for event in self._recording:
+            if event.topic not in self._outputs or event.kind is EventKind.LOSS:
+                continue
+            if first is None or beginning is None:
+                first, beginning = event.epoch, event.version
+            if event.epoch == first and event.version < beginning + self._seek_ns:
+                continue
+            if epoch is None or event.epoch > epoch:
+                if epoch is not None:
+                    self._new_epoch()
+                epoch, origin, start = event.epoch, event.version, time.perf_counter()
+                newest.clear()
+            if self._rate is not None and origin is not None:
+                due = start + (event.version - origin) / 1e9 / self._rate
+                self._stopping.wait(max(0.0, due - time.perf_counter()))
+            if self._stopping.is_set() or not self._on_event(event):
+                self._stopping.set()
+                return
+            self._publish(event, event.version < newest.get(event.topic, -1))
+            newest[event.topic] = max(event.version, newest.get(event.topic, -1))
+
+    def _new_epoch(self) -> None:
+        self._before_epoch()
+        for topic in self._mesh.topics():
+            self._mesh.window(topic).new_epoch()
+
+    def _publish(self, event: RecordedEvent, late: bool) -> None:
+        output = self._outputs[event.topic]
+        if event.kind is EventKind.SETTLE:
+            output.settle(event.version)
+            return
+        try:
+            value = event.value
+        except (ValueError, LookupError) as error:
+            if not self.skipped[event.topic]:
+                _log.warning("%s: %s at %d is skipped: %s", self._recording.path, event.topic, event.version, error)
+            self.skipped[event.topic] += 1
+            return
+        with output.allocate_change() as change:
+            change.set_version(event.version)
+            change.value = value
+            output.commit(CommitPolicy.INSERT_SORTED if late else CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+        self.published[event.topic] += 1
