@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .errors import ConfigError, DeviceError, ModelError, SourceError, WarploomError
     from .kernels.bev import BevMaps, bev
     from .kernels.boxes import FitBoxes, fit_boxes
+    from .kernels.chain import ChainConfig, KernelChain
+    from .kernels.chain_result import ChainDropped, ChainResult
     from .kernels.cloud import Cloud
     from .kernels.cluster import EuclideanCluster, cluster
     from .kernels.dbscan import Dbscan, dbscan
@@ -52,6 +54,8 @@ _HOMES = {
     "errors": ("ConfigError", "DeviceError", "ModelError", "SourceError", "WarploomError"),
     "kernels.bev": ("BevMaps", "bev"),
     "kernels.boxes": ("FitBoxes", "fit_boxes"),
+    "kernels.chain": ("ChainConfig", "KernelChain"),
+    "kernels.chain_result": ("ChainDropped", "ChainResult"),
     "kernels.cloud": ("Cloud",),
     "kernels.cluster": ("EuclideanCluster", "cluster"),
     "kernels.dbscan": ("Dbscan", "dbscan"),
@@ -86,6 +90,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "BevMaps",
+    "ChainConfig",
+    "ChainDropped",
+    "ChainResult",
     "Cloud",
     "ConfigError",
     "Dbscan",
@@ -103,6 +110,7 @@ __all__ = [
     "InversePerspective",
     "KalmanFilter",
     "KalmanUpdate",
+    "KernelChain",
     "Latency",
     "ModelError",
     "MotionCompensation",
