@@ -1,6 +1,7 @@
 """Filters: takes out of a cloud what no later stage should see, and says how much and why.
 
-What stays keeps its order. A CPU packs the points in one pass; a GPU by a scan over flags, to the same bytes.
+What stays keeps its order. A CPU counts what stays of each part of the cloud, and packs the parts side by side; a GPU
+packs by a scan over flags, to the same bytes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
-from .interop import adopt, borrow_points, count_on, give
+from .interop import Points, adopt, borrow_points, count_on, give
+from .parts import part_start, parts_for, run_parts
 from .plan import capacity_for, plan_for
 
 __all__ = ["Filtered", "PointFilter", "filter_points"]
@@ -22,6 +24,7 @@ __all__ = ["Filtered", "PointFilter", "filter_points"]
 _NON_FINITE, _OUT_OF_RANGE, _EGO, _KEPT = (wp.constant(i) for i in range(4))
 _EVERYWHERE = (-math.inf, -math.inf, -math.inf, math.inf, math.inf, math.inf)
 _NOWHERE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_LEAST_PART = 100_000  # points; fewer are packed sooner than a second thread is woken
 
 
 @wp.struct
@@ -40,7 +43,7 @@ def _inside(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
 @wp.func
 def _verdict(p: wp.vec3, limits: _Limits) -> int:
     """The reason why a point goes, the first that holds, or that it stays."""
-    if not (wp.isfinite(p[0]) and wp.isfinite(p[1]) and wp.isfinite(p[2])):
+    if (p[0] - p[0]) + (p[1] - p[1]) + (p[2] - p[2]) != 0.0:
         return _NON_FINITE
     if not _inside(p, limits.low, limits.high):
         return _OUT_OF_RANGE
@@ -49,46 +52,132 @@ def _verdict(p: wp.vec3, limits: _Limits) -> int:
     return _KEPT
 
 
-@wp.kernel
-def _pack_in_order(
+# In C++, where a compiler sees loops that it can turn into vector instructions: four times as fast as the same in
+# Python. Points are judged in blocks without a branch, then those that stay are copied; their place is known by then.
+@wp.func_native("""
+    constexpr int BLOCK = 256;
+    const auto run = [&](const float* __restrict points, const long long step) {
+        const float low[3] = {limits.low[0], limits.low[1], limits.low[2]};
+        const float high[3] = {limits.high[0], limits.high[1], limits.high[2]};
+        const float ego_low[3] = {limits.ego_low[0], limits.ego_low[1], limits.ego_low[2]};
+        const float ego_high[3] = {limits.ego_high[0], limits.ego_high[1], limits.ego_high[2]};
+        int all_finite = 0, all_inside = 0, all_kept = 0;
+        for (int start = first; start < last; start += BLOCK) {
+            const int length = last - start < BLOCK ? last - start : BLOCK;
+            const float* __restrict at = points + start * step;
+            int stays[BLOCK], chosen[BLOCK];
+            int finite = 0, inside = 0;
+            for (int k = 0; k < length; ++k) {
+                const float x = at[k * step], y = at[k * step + 1], z = at[k * step + 2];
+                const int is_finite = (x - x) + (y - y) + (z - z) == 0.0f;
+                const int is_inside = is_finite & (x >= low[0]) & (y >= low[1]) & (z >= low[2])
+                    & (x < high[0]) & (y < high[1]) & (z < high[2]);
+                const int is_ego = (x >= ego_low[0]) & (y >= ego_low[1]) & (z >= ego_low[2])
+                    & (x < ego_high[0]) & (y < ego_high[1]) & (z < ego_high[2]);
+                finite += is_finite;
+                inside += is_inside;
+                stays[k] = is_inside & (1 - is_ego);
+            }
+            int kept = 0;
+            for (int k = 0; k < length; ++k) {
+                chosen[kept] = k;
+                kept += stays[k];
+            }
+            if (index_out.data) {
+                const long long to = place + all_kept, width = xyz_out.strides[0] / 4;
+                float* xyz_to = (float*)xyz_out.data + to * width;
+                int* index_to = index_out.data + to;
+                for (int k = 0; k < kept; ++k) {
+                    const float* from = at + chosen[k] * step;
+                    const float x = from[0], y = from[1], z = from[2];
+                    xyz_to[k * width] = x;
+                    xyz_to[k * width + 1] = y;
+                    xyz_to[k * width + 2] = z;
+                    index_to[k] = start + chosen[k];
+                }
+                if (intensity_out.data) {
+                    const long long step_in = intensity_in.strides[0] / 4, step_out = intensity_out.strides[0] / 4;
+                    const float* intensity_from = intensity_in.data + start * step_in;
+                    float* intensity_to = intensity_out.data + to * step_out;
+                    for (int k = 0; k < kept; ++k)
+                        intensity_to[k * step_out] = intensity_in.data ? intensity_from[chosen[k] * step_in] : 0.0f;
+                }
+            }
+            all_finite += finite;
+            all_inside += inside;
+            all_kept += kept;
+        }
+        if (!tallied) {
+            tally.data[3 * part] = all_finite;
+            tally.data[3 * part + 1] = all_inside;
+            tally.data[3 * part + 2] = all_kept;
+        }
+    };
+    const float* points = (const float*)xyz_in.data;
+    if (xyz_in.strides[0] == 16) run(points, 4);
+    else if (xyz_in.strides[0] == 12) run(points, 3);
+    else run(points, xyz_in.strides[0] / 4);
+""")
+def _pack(
     # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    intensity_in: wp.array(dtype=wp.float32),
+    limits: _Limits,
+    first: int,
+    last: int,
+    part: int,
+    place: int,
+    tallied: int,
+    # in out
+    tally: wp.array2d(dtype=wp.int32),
+    # out: the last null where points are only to be counted
+    xyz_out: wp.array(dtype=wp.vec3),
+    intensity_out: wp.array(dtype=wp.float32),
+    index_out: wp.array(dtype=wp.int32),
+):
+    """Packs those of the points first … last − 1 that stay, from `place` on; tallies the finite, inside and kept."""
+
+
+@wp.kernel
+def _pack_part(
+    # in
+    part: int,
+    parts: int,
     xyz_in: wp.array(dtype=wp.vec3),
     intensity_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
     limits: _Limits,
-    # out
+    tallied: int,
+    # in out: of each part its points that are finite, inside the range as well, and kept
+    tally: wp.array2d(dtype=wp.int32),
+    # out: null where points are only to be counted
     xyz_out: wp.array(dtype=wp.vec3),
     intensity_out: wp.array(dtype=wp.float32),
     index_out: wp.array(dtype=wp.int32),
     count_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
 ):
-    """Keeps and counts in one pass, by one thread."""
-    kept = int(0)
-    non_finite = int(0)
-    out_of_range = int(0)
-    ego = int(0)
-    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        p = xyz_in[i]
-        verdict = _verdict(p, limits)
-        if verdict == _KEPT:
-            xyz_out[kept] = p
-            if intensity_in:
-                intensity_out[kept] = intensity_in[i]
-            else:
-                intensity_out[kept] = 0.0
-            index_out[kept] = i
-            kept += 1
-        elif verdict == _NON_FINITE:
-            non_finite += 1
-        elif verdict == _OUT_OF_RANGE:
-            out_of_range += 1
-        else:
-            ego += 1
-    count_out[0] = kept
-    dropped_out[_NON_FINITE] = non_finite
-    dropped_out[_OUT_OF_RANGE] = out_of_range
-    dropped_out[_EGO] = ego
+    """Packs one of the parts that the points are cut into, behind what the parts before it keep."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    place = int(0)
+    if tallied != 0:
+        for before in range(part):
+            place += tally[before, 2]
+    first = part_start(n, part, parts)
+    last = part_start(n, part + 1, parts)
+    _pack(xyz_in, intensity_in, limits, first, last, part, place, tallied, tally, xyz_out, intensity_out, index_out)
+    if part == 0 and count_out:
+        finite = int(0)
+        inside = int(0)
+        kept = int(0)
+        for each in range(parts):
+            finite += tally[each, 0]
+            inside += tally[each, 1]
+            kept += tally[each, 2]
+        count_out[0] = kept
+        dropped_out[_NON_FINITE] = n - finite
+        dropped_out[_OUT_OF_RANGE] = finite - inside
+        dropped_out[_EGO] = inside - kept
 
 
 @wp.kernel
@@ -168,6 +257,10 @@ class PointFilter:
     """xmin ymin zmin xmax ymax zmax [m] of the own vehicle, whose points go, upper bounds open; None for none."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`parts` (packed part by part), `scan` (parallel), or `auto`: `parts` on a CPU, else `scan`. Results are equal."""
+    parts: int | None = None
+    """How many parts of the cloud are packed at once, by the method `parts`; by default as the threads are worth it."""
 
     xyz: wp.array = field(init=False, repr=False)
     """Positions of the points that stay [m], shape (capacity,), vec3."""
@@ -189,6 +282,11 @@ class PointFilter:
         limits.low, limits.high = wp.vec3(*inside[:3]), wp.vec3(*inside[3:])
         limits.ego_low, limits.ego_high = wp.vec3(*ego[:3]), wp.vec3(*ego[3:])
         device = resolve_device(self.device)
+        if self.method not in ("auto", "parts", "scan"):
+            raise ValueError(f"method must be 'auto', 'parts' or 'scan', not {self.method!r}")
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts must be at least 1, not {self.parts}")
+        by_parts = self.method == "parts" or (self.method == "auto" and device == DEFAULT_DEVICE)
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
@@ -202,7 +300,11 @@ class PointFilter:
         buffer("index", self.capacity, wp.int32)
         buffer("count", 1, wp.int32)
         buffer("dropped", 3, wp.int32)
-        if device != DEFAULT_DEVICE:
+        keep("_by_parts", by_parts)
+        if by_parts:
+            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            keep("_tally", wp.zeros((self._parts, 3), dtype=wp.int32, device=device))
+        else:
             buffer("_kept", self.capacity, wp.int32)
             buffer("_rank", self.capacity, wp.int32)
 
@@ -217,15 +319,8 @@ class PointFilter:
         n = xyz.shape[0]
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
-        packed = [self.xyz, self.intensity, self.index, self.count]
-        if self.xyz.device.is_cpu:
-            wp.launch(
-                _pack_in_order,
-                1,
-                inputs=[xyz, intensity, count, self._limits],
-                outputs=[*packed, self.dropped],
-                device=self.device,
-            )
+        if self._by_parts:
+            self._pack(xyz, intensity, count, self.xyz, self.intensity)
             return
         self.dropped.zero_()
         wp.launch(
@@ -240,9 +335,47 @@ class PointFilter:
             _pack_by_rank,
             self.capacity,
             inputs=[xyz, intensity, self._kept, self._rank],
-            outputs=packed,
+            outputs=[self.xyz, self.intensity, self.index, self.count],
             device=self.device,
         )
+
+    def _pack(
+        self,
+        xyz: wp.array,
+        intensity: wp.array | None,
+        count: wp.array,
+        packed_xyz: wp.array,
+        packed_intensity: wp.array | None,
+    ) -> None:
+        """Packs part by part into arrays with room for all points."""
+        given, parts = [xyz, intensity, count, self._limits], self._parts
+        if parts > 1:
+            run_parts(_pack_part, parts, self.device, [*given, 0], [self._tally, None, None, None, None, None])
+        packed = [packed_xyz, packed_intensity, self.index, self.count, self.dropped]
+        run_parts(_pack_part, parts, self.device, [*given, int(parts > 1)], [self._tally, *packed])
+
+    def _pack_rows(self, points: Points, count: wp.array) -> np.ndarray:
+        """Packs points on the host, with all their columns, straight into an array of its own."""
+        n, columns = points.table.shape
+        host = np.empty((n, columns), np.float32)
+
+        def column(offset: int, dtype: type) -> wp.array:
+            return wp.array(
+                ptr=host.ctypes.data + 4 * offset if n else None,
+                dtype=dtype,
+                shape=(n,),
+                strides=(4 * columns,),
+                device=DEFAULT_DEVICE,
+            )
+
+        fourth = column(3, wp.float32) if columns > 3 else None
+        self._pack(points.xyz, points.intensity, count, column(0, wp.vec3), fourth)
+        kept = int(self.count.numpy()[0])
+        if columns > 4:
+            rows = wp.array(host, copy=False, device=DEFAULT_DEVICE)
+            wp.launch(_gather_rows, kept, inputs=[points.table, self.index], outputs=[rows], device=DEFAULT_DEVICE)
+        # A few that stay shall not hold the memory of the many that went.
+        return host[:kept] if 2 * kept >= n else host[:kept].copy()
 
 
 def _checked_box(name: str, box: Sequence[float]) -> tuple[float, ...]:
@@ -295,17 +428,16 @@ def filter_points(
         ego_box=None if ego_box is None else _checked_box("ego_box", ego_box),
         device=borrowed.device,
     )
-    plan.launch(borrowed.xyz, borrowed.intensity, count_on(n, borrowed.device))
-    kept = int(plan.count.numpy()[0])
-    on_host = borrowed.device == DEFAULT_DEVICE
-    host = np.empty((kept, columns), np.float32) if on_host else None
-    rows = wp.array(host, copy=False, device="cpu") if on_host else wp.empty((kept, columns), device=borrowed.device)
-    wp.launch(_gather_rows, kept, inputs=[borrowed.table, plan.index], outputs=[rows], device=borrowed.device)
+    count = count_on(n, borrowed.device)
+    if borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, borrowed.intensity, count)
+        kept = int(plan.count.numpy()[0])
+        rows = wp.empty((kept, columns), dtype=wp.float32, device=borrowed.device)
+        wp.launch(_gather_rows, kept, inputs=[borrowed.table, plan.index], outputs=[rows], device=borrowed.device)
+        stayed = give(rows, borrowed.family)
+    else:
+        host = plan._pack_rows(borrowed, count)
+        kept = len(host)
+        stayed = adopt(host, borrowed.family)
     non_finite, out_of_range, ego = (int(number) for number in plan.dropped.numpy())
-    return Filtered(
-        adopt(host, borrowed.family) if host is not None else give(rows, borrowed.family),
-        give(plan.index[:kept], borrowed.family),
-        non_finite,
-        out_of_range,
-        ego,
-    )
+    return Filtered(stayed, give(plan.index[:kept], borrowed.family), non_finite, out_of_range, ego)

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warploom.kernels.filters import PointFilter, filter_points
+from warploom.kernels.interop import borrow_points, count_on
 
 RANGE = (-20.0, -10.0, -2.0, 20.0, 10.0, 1.0)
 EGO = (-2.0, -1.0, -2.0, 3.0, 1.0, 0.5)
@@ -95,6 +96,73 @@ def test_the_plan_reads_its_count(device):
     assert not plan.intensity.numpy()[:n].any()
 
 
+WAYS = [{"method": "parts", "parts": parts} for parts in (1, 2, 3, 7)] + [{"method": "scan"}]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3000), st.sampled_from(WAYS))
+def test_the_result_does_not_hang_on_the_parts(seed, n, way):
+    points = cloud(n, seed)
+    index, counts = reference(points)
+    plan = PointFilter(capacity=n, point_range=RANGE, ego_box=EGO, **way)
+    given_points = borrow_points(points)
+    plan.launch(given_points.xyz, given_points.intensity, count_on(n, "cpu"))
+    kept = int(plan.count.numpy()[0])
+    assert np.array_equal(plan.index.numpy()[:kept], index)
+    assert np.array_equal(plan.xyz.numpy()[:kept], points[index, :3])
+    assert np.array_equal(plan.intensity.numpy()[:kept], points[index, 3])
+    assert tuple(plan.dropped.numpy()) == counts
+
+
+@pytest.mark.parametrize("way", WAYS, ids=str)
+def test_a_captured_launch_replays_on_other_points(way):
+    plan = PointFilter(capacity=900, point_range=RANGE, ego_box=EGO, **way)
+    points = cloud(900, 1)
+    xyz, count = wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu"), count_on(900, "cpu")
+    plan.launch(xyz, None, count)
+    with wp.ScopedCapture(device="cpu") as capture:
+        plan.launch(xyz, None, count)
+    others = cloud(900, 2)
+    xyz.assign(others[:, :3])
+    wp.capture_launch(capture.graph)
+    index, counts = reference(others)
+    assert np.array_equal(plan.index.numpy()[: len(index)], index)
+    assert tuple(plan.dropped.numpy()) == counts
+
+
+@pytest.mark.parametrize("layout", ["strided", "columns first", "backwards", "read-only", "float64", "three columns"])
+def test_any_layout_gives_the_same(layout):
+    points = cloud(700, 5)
+    index, _ = reference(points)
+    made = {
+        "strided": lambda: np.repeat(points, 2, axis=0)[::2],
+        "columns first": lambda: np.asfortranarray(points),
+        "backwards": lambda: points[::-1].copy()[::-1],
+        "read-only": lambda: points.copy(),
+        "float64": lambda: points.astype(np.float64),
+        "three columns": lambda: points[:, :3],
+    }[layout]()
+    made.setflags(write=layout != "read-only")
+    kept = filter_points(made, point_range=RANGE, ego_box=EGO)
+    assert np.array_equal(kept.index, index)
+    assert np.array_equal(kept.points, points[index, : made.shape[1]])
+
+
+def test_denormal_and_huge_coordinates_are_compared_as_they_are():
+    tiny, huge = np.float32(1e-45), np.finfo(np.float32).max
+    points = np.float32([[tiny, 0, 0], [-tiny, 0, 0], [0, 0, 0], [huge, huge, huge], [-huge, 0, 0], [1e5, -1e5, 1e5]])
+    assert filter_points(points, point_range=(0, -1e6, -1, 1e6, 1e6, 1e6)).index.tolist() == [0, 2, 5]
+    assert len(filter_points(points).index) == 6
+
+
+def test_few_that_stay_do_not_hold_the_memory_of_all():
+    points = np.zeros((1000, 4), np.float32)
+    points[10:, 0] = np.nan
+    kept = filter_points(points).points
+    assert len(kept) == 10
+    assert kept.base is None
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -102,6 +170,8 @@ def test_the_plan_reads_its_count(device):
         (lambda: filter_points(np.zeros((4, 3), np.float32), point_range=(0, 0, 0, 1, 1)), "point_range must be"),
         (lambda: filter_points(np.zeros((4, 3), np.float32), ego_box=(0, 0, 0, 1, 1, 0)), "ego_box must be"),
         (lambda: PointFilter(capacity=0), "capacity must be"),
+        (lambda: PointFilter(capacity=5, parts=0), "parts must be at least 1, not 0"),
+        (lambda: PointFilter(capacity=5, method="fast"), "method must be 'auto', 'parts' or 'scan', not 'fast'"),
     ],
 )
 def test_wrong_arguments_are_refused(call, message):
