@@ -54,6 +54,7 @@ def bench_frame(benchmark, contest, pipeline, scan):
     }
 
 
+@pytest.mark.slow
 def bench_memory(benchmark, scans, pipeline, tmp_path):
     """A process of its own perceives a thousand whole frames and writes their objects."""
     if not sys.platform.startswith("linux"):

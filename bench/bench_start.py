@@ -44,6 +44,7 @@ def bench_import(benchmark):
     record_figure(benchmark, "import warploom", np.median(said[1:]), "s", goal=0.3, note=f"median of {REPEATS}")
 
 
+@pytest.mark.slow
 def bench_compilation(benchmark, tmp_path):
     """The first call of each function with an empty kernel cache, then with that cache filled, in new processes."""
     benchmark.extra_info.update(kernel="compilation", on="cpu")
@@ -60,6 +61,7 @@ def bench_compilation(benchmark, tmp_path):
     record_figure(benchmark, "kernels of the API, from the cache", everything, "s", note=f"{len(warm)} functions")
 
 
+@pytest.mark.slow
 def bench_first_frame(benchmark, scans, tmp_path):
     """`warploom run --frames 1` on a scan of about 120 thousand points, as a whole: from the shell and back."""
     try:

@@ -148,7 +148,7 @@ def test_info_tells_the_machine_or_what_a_file_holds(warploom, scans):
     assert "4" in warploom("info", scans)
 
 
-@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph"])
+@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph", "bench"])
 def test_every_command_has_help_with_an_example(warploom, command):
     assert "Example:" in warploom(command, "--help")
 

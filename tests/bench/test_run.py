@@ -1,0 +1,96 @@
+"""`warploom bench`, run as its users run it: in a process of its own, far from the checkout."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from warploom.bench.run import run_benchmarks
+from warploom.errors import ConfigError, DeviceError
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """Runs the command in a folder of its own, whose own settings for pytest would break it."""
+    folder = tmp_path_factory.mktemp("bench")
+    (folder / "pytest.ini").write_text("[pytest]\naddopts = --no-such-option\n")
+
+    def run(*arguments, expect=0):
+        command = [sys.executable, "-c", "from warploom.cli import main; main()", "bench", *map(str, arguments)]
+        done = subprocess.run(command, cwd=folder, env=os.environ | {"COLUMNS": "250"}, capture_output=True, text=True)
+        assert done.returncode == expect, done.stdout + done.stderr
+        return " ".join((done.stdout + done.stderr).split())
+
+    run.folder = folder
+    return run
+
+
+@pytest.fixture(scope="module")
+def first(bench):
+    """What a short run printed, and its JSON."""
+    output = bench("--filter", "kalman 30-", "--filter", "launch", "--quick", "--out", "first")
+    return output, json.loads((bench.folder / "first" / "benchmark.json").read_text())
+
+
+def test_the_filters_choose_by_words_and_cpu_is_where_ours_computes(first):
+    names = {entry["name"] for entry in first[1]["benchmarks"]}
+    assert names == {
+        "bench_kalman[30-warploom cpu]",
+        "bench_kalman[30-warploom plan cpu]",
+        "bench_kalman[30-numpy, batched]",
+        "bench_kalman[30-numpy, track by track]",
+        "bench_launch[launch-cpu]",
+        "bench_launch[recorded-cpu]",
+    }
+
+
+def test_times_stand_in_a_table_beside_the_peers_and_in_a_report(first, bench):
+    output, measured = first
+    assert "numpy, batched" in output
+    assert "launch of a kernel, cpu" in output
+    report = (bench.folder / "first" / "benchmarks.md").read_text(encoding="utf-8")
+    assert "### kalman" in report
+    ours = next(e["extra_info"] for e in measured["benchmarks"] if e["extra_info"].get("who") == "warploom")
+    assert ours["threads"] >= 1
+    assert 0 < ours["busy_cores"] < 128
+
+
+def test_an_earlier_run_stands_beside_the_new_one(first, bench):
+    measured = json.loads(json.dumps(first[1]))
+    for entry in measured["benchmarks"]:
+        if entry["extra_info"].get("who") == "warploom":
+            entry["stats"]["median"] /= 1000  # ours was a thousand times faster then
+    (bench.folder / "old.json").write_text(json.dumps(measured))
+    output = bench("--filter", "kalman 30-", "--quick", "--compare", "old.json", "--out", "second")
+    assert "since the earlier run" in output
+    assert "1 of 2 slower by more than 20%" in output
+    assert "ratios to the peers" in output
+
+
+def test_a_name_that_no_benchmark_has_ends_with_2_and_those_that_there_are(bench):
+    assert "no benchmark's name has 'abacus'; there are bev, cluster" in bench("--filter", "abacus", expect=2)
+
+
+def test_an_earlier_run_of_another_kind_is_refused_by_name(tmp_path):
+    with pytest.raises(ConfigError, match=r"missing\.json: cannot be read"):
+        run_benchmarks(compare=tmp_path / "missing.json", out=tmp_path / "out")
+    (tmp_path / "other.json").write_text('{"benchmarks": []}')
+    with pytest.raises(ConfigError, match=r"other\.json: has no keys"):
+        run_benchmarks(compare=tmp_path / "other.json", out=tmp_path / "out")
+
+
+def test_a_device_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(DeviceError, match="no device 'cuda:9'"):
+        run_benchmarks(device="cuda:9", out=tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["pytest", "pytest_benchmark"])
+def test_what_it_needs_and_how_to_get_it_is_said(missing, monkeypatch, tmp_path):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == missing else find(name, *more))
+    with pytest.raises(ConfigError, match=rf"needs {missing.replace('_', '-')}, .*pip install 'warploom\[bench\]'"):
+        run_benchmarks(out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
