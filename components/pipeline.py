@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -113,13 +113,37 @@ class Pipeline:
         self._context = execution_context(profile, device)
         self._timings: dict[int, list[VertexTiming]] = {}
         self._timings_lock = threading.Lock()
+        self._on_timing: list[Callable[[VertexTiming], None]] = []
         self._process: Process | None = None
         self._next: tuple[Process, bool] | None = (self._build(offline=True), True)
         self._mesh = DataMesh()
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The configuration it was made from: the profile's file, then those of its modules."""
+        return (self._profile.path, *(module.path for module in self._modules))
+
+    def on_timing(self, callback: Callable[[VertexTiming], None]) -> None:
+        """Calls back after every run of a vertex, in the worker's thread."""
+        self._on_timing.append(callback)
+
+    def take_process(self, *, offline: bool) -> Process:
+        """A process of its modules, not started: for whoever feeds topics himself, where `run` feeds LiDAR frames.
+
+        Args:
+            offline: Its backlogs block whoever commits, so that nothing is lost.
+        """
+        ready, self._next = self._next, None
+        return ready[0] if ready is not None and ready[1] is offline else self._build(offline=offline)
+
     @classmethod
     def from_profile(
-        cls, name: str = "cpu", *, device: str | None = None, settings: Iterable[str] | Mapping[str, Any] = ()
+        cls,
+        name: str = "cpu",
+        *,
+        device: str | None = None,
+        settings: Iterable[str] | Mapping[str, Any] = (),
+        workers: int | None = None,
     ) -> Self:
         """Makes the pipeline of a hardware profile.
 
@@ -128,6 +152,7 @@ class Pipeline:
             device: The Warp device, in place of the profile's.
             settings: Changes by dotted key, as a mapping or as texts `key=value`: `component.vertex.key` for a module,
                 `profile.key` for the profile. Keys of the environment (`WARPLOOM__component__vertex__key`) come first.
+            workers: Threads of every graph, and frames that may be in it at once, in place of what the modules say.
 
         Raises:
             ConfigError: Profile, module or setting is bad.
@@ -143,7 +168,11 @@ class Pipeline:
         in_profile = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
         of_modules = {**in_profile, **{keys: value for keys, value in changes.items() if keys[0] != "profile"}}
         modules = [load_module(_find_module(profile, module), of_modules) for module in profile.content.modules]
-        known = {component.name for module in modules for component in module.content.components}
+        components = [component for module in modules for component in module.content.components]
+        if workers is not None:
+            graphs = {(one.name, key): workers for one in components if one.graph for key in ("workers", "in_flight")}
+            modules = [load_module(module.path, {**of_modules, **graphs}) for module in modules]
+        known = {component.name for component in components}
         for keys in of_modules:
             if keys[0] not in known:
                 raise ConfigError(
@@ -171,11 +200,19 @@ class Pipeline:
         )
 
     def _record(self, timing: VertexTiming) -> None:
-        with self._timings_lock:
-            self._timings.setdefault(timing.version, []).append(timing)
+        if self._process is not None:  # else nobody will take them
+            with self._timings_lock:
+                self._timings.setdefault(timing.version, []).append(timing)
+        for callback in self._on_timing:
+            callback(timing)
 
     def run(
-        self, source: Iterable[SensorFrame], *, topics: Iterable[str] = (), realtime: bool = False
+        self,
+        source: Iterable[SensorFrame],
+        *,
+        topics: Iterable[str] = (),
+        realtime: bool = False,
+        watch: Callable[[Process], None] | None = None,
     ) -> Iterator[PerceptionFrame]:
         """Perceives the frames of a source, in their order.
 
@@ -184,6 +221,7 @@ class Pipeline:
             topics: Further topics of the modules, whose data each frame brings in `data`.
             realtime: Frames are fed at the pace of their versions, and what is too slow drops frames as its backlog
                 says, counted in `losses`. Otherwise nothing is dropped: every frame of the source comes out.
+            watch: Is given the process before it starts, to record its topics for example.
 
         Yields:
             One PerceptionFrame for each frame of the source, in its order.
@@ -197,11 +235,12 @@ class Pipeline:
         for topic in topics:
             if topic not in given:
                 raise ConfigError(f"no component gives topic {topic!r}; {nearest(topic, given)}")
-        ready, self._next = self._next, None
-        process = ready[0] if ready is not None and ready[1] is not realtime else self._build(offline=not realtime)
+        process = self.take_process(offline=not realtime)
         self._process, self._mesh = process, process.mesh
         with self._timings_lock:
             self._timings.clear()
+        if watch is not None:
+            watch(process)
         run = _Run(self, process, source, topics, realtime)
         try:
             yield from run.frames()
@@ -265,7 +304,7 @@ class _Run:
         for topic in self._topics:
             process.mesh.window(topic).subscribe(
                 lambda entry, topic=topic: self._events.put((topic, entry)),
-                lambda version, topic=topic: self._events.put((topic, version)),
+                lambda version, epoch, topic=topic: self._events.put((topic, version)),
             )
 
     def frames(self) -> Iterator[PerceptionFrame]:

@@ -112,9 +112,9 @@ class DataProcessComponent(Component):
         window.subscribe(self._on_commit, self._on_settle)
 
     def _on_commit(self, entry: Entry) -> None:
-        self._offer(Trigger(entry.version, entry.received_ns))
+        self._offer(Trigger(entry.version, entry.received_ns, settled=not entry.triggers))
 
-    def _on_settle(self, version: int) -> None:
+    def _on_settle(self, version: int, epoch: int) -> None:
         self._offer(Trigger(version, settled=True))
 
     def _offer(self, trigger: Trigger) -> None:

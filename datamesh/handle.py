@@ -10,16 +10,23 @@ The declarations are the component's interface; the runtime binds each to the wi
 from __future__ import annotations
 
 import operator
-import time
+import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
-from .status import Status
-from .window import CommitPolicy, Entry, Snapshot, Window
+from .clock import Timer
+from .payload import Completion
+from .policy import CommitPolicy, EqualVersion, Reorder
+from .snapshot import CURRENT_EPOCH, Entry, Snapshot
+from .status import Outcome, Status
+from .waiting import Waiting
+from .window import Window
 
 __all__ = ["Accessor", "Change", "Input", "Output", "declared_handles"]
 
 T = TypeVar("T")
+_NOTHING: Any = object()
 
 
 class Accessor(Generic[T]):
@@ -28,34 +35,49 @@ class Accessor(Generic[T]):
     with handle.access() as snapshot: …
     """
 
-    def __init__(self, window: Window[T]) -> None:
+    __slots__ = ("_epoch", "_snapshot", "_stream", "_window")
+
+    def __init__(self, window: Window[T], epoch: int = CURRENT_EPOCH, stream: Any = None) -> None:
         self._window = window
+        self._epoch = epoch
+        self._stream = stream
         self._snapshot: Snapshot[T] | None = None
 
     def __enter__(self) -> Snapshot[T]:
-        self._snapshot = self._window.snapshot()
+        self._snapshot = self._window.snapshot(self._epoch, self._stream)
         return self._snapshot
 
     def __exit__(self, *_: object) -> None:
+        if self._window.check and self._snapshot is not None:
+            for index in range(len(self._snapshot)):
+                self._window.verify(self._snapshot.entry(index))
         self._snapshot = None
 
 
 class Change(Generic[T]):
     """One change of data: set its version, write its value, commit it once; otherwise nothing is published.
 
-    As a context manager it is abandoned, and counted, when it is left without a commit.
+    Left as a context manager without a commit, or dropped, it is abandoned, and counted.
     """
 
-    def __init__(self, window: Window[T]) -> None:
+    __slots__ = ("_closed", "_completion", "_epoch", "_received_ns", "_value", "_version", "_window")
+
+    def __init__(self, window: Window[T], epoch: int = CURRENT_EPOCH) -> None:
         self._window = window
+        self._epoch = epoch
         self._version: int | None = None
-        self._value: T | None = None
-        self._has_value = False
+        self._value: T = _NOTHING
         self._closed = False
         self._received_ns: int | None = None
+        self._completion: Completion | None = None
 
-    def set_version(self, version: int, received_ns: int | None = None) -> None:
-        """Sets the version [ns], and when the sensor's data was received, if that was not just now.
+    def set_version(self, version: int, received_ns: int | None = None, *, epoch: int | None = None) -> None:
+        """Sets the version.
+
+        Args:
+            version: Time of reception of the frame [ns].
+            received_ns: The clock's `monotonic_ns` when the sensor's data was received, if that was not just now.
+            epoch: Of the version; by default that of the frame the component works on, or else the window's.
 
         Raises:
             TypeError: The version is not a whole number.
@@ -66,20 +88,25 @@ class Change(Generic[T]):
             raise ValueError(f"version must be an unsigned 64-bit number of nanoseconds, not {version}")
         self._version = version
         self._received_ns = received_ns
+        if epoch is not None:
+            self._epoch = epoch
 
     @property
     def value(self) -> T:
         """What will be committed."""
-        if not self._has_value:
+        if self._value is _NOTHING:
             raise LookupError("the change has no value yet")
-        return self._value  # type: ignore[return-value]
+        return self._value
 
     @value.setter
     def value(self, value: T) -> None:
         if self._closed:
             raise RuntimeError(f"this change of {self._window.topic!r} was committed or abandoned; allocate another")
         self._value = value
-        self._has_value = True
+
+    def completes_with(self, completion: Completion) -> None:
+        """Says that a device is still writing the value, and which event ends it; readers wait for that."""
+        self._completion = completion
 
     def __enter__(self) -> Change[T]:
         return self
@@ -87,24 +114,34 @@ class Change(Generic[T]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._abandon()
+
+    def __del__(self) -> None:
+        self._abandon()
+
+    def _abandon(self) -> None:
         if not self._closed:
             self._closed = True
             self._window.losses.count(self._window.topic, "abandoned", self._version or 0)
 
-    def _commit(self, policy: CommitPolicy) -> Status:
-        topic = self._window.topic
+    def _commit(self, policy: CommitPolicy | Reorder, equal: EqualVersion, triggers: bool | None) -> Status:
+        window, version, value = self._window, self._version, self._value
         if self._closed:
             raise RuntimeError(
-                f"this change of {topic!r} was committed or abandoned already; a change is committed once"
+                f"this change of {window.topic!r} was committed or abandoned already; a change is committed once"
             )
-        if self._version is None:
-            raise ValueError(f"the change of {topic!r} has no version: call set_version before the commit")
-        if not self._has_value:
-            raise ValueError(f"the change of {topic!r} has no value: set `.value` before the commit")
+        if version is None:
+            raise ValueError(f"the change of {window.topic!r} has no version: call set_version before the commit")
+        if value is _NOTHING:
+            raise ValueError(f"the change of {window.topic!r} has no value: set `.value` before the commit")
         self._closed = True
-        now = time.perf_counter_ns()
-        received = self._received_ns if self._received_ns is not None else now
-        return self._window.commit(policy, Entry(self._version, self._value, received, now))
+        now = window.clock.monotonic_ns()
+        received = now if self._received_ns is None else self._received_ns
+        entry = Entry(version, value, received, now, self._epoch, True, self._completion)
+        status = window.commit(policy, entry, equal, triggers)
+        if status is Status.REJECTED:
+            self._closed = False
+        return status
 
 
 class _Handle(Generic[T]):
@@ -119,6 +156,8 @@ class _Handle(Generic[T]):
         self.optional = optional
         self.name = ""
         self.payload: Any = object
+        self.epoch = CURRENT_EPOCH
+        """Of the frame that the component works on, which the runtime sets where that is one at a time."""
         self._window: Window[T] | None = None
 
     def bind(self, name: str, window: Window[T]) -> None:
@@ -146,9 +185,97 @@ class _Handle(Generic[T]):
 class Input(_Handle[T]):
     """Reads a topic."""
 
-    def access(self) -> Accessor[T]:
-        """A scoped snapshot of the topic's window."""
-        return Accessor(self.window)
+    def __init__(self, *, optional: bool = False) -> None:
+        super().__init__(optional=optional)
+        self._waits: set[Waiting[T]] | None = set()
+        self._lock = threading.Lock()
+
+    def access(self, epoch: int | None = None, stream: Any = None) -> Accessor[T]:
+        """A scoped snapshot of the topic's window.
+
+        Args:
+            epoch: Whose data; by default that of the frame the component works on, or else the window's.
+            stream: Where the values will be read; None is on the host. Values that a device is still writing are
+                waited for accordingly.
+        """
+        return Accessor(self.window, self.epoch if epoch is None else epoch, stream)
+
+    def wait(
+        self, version: int, timeout_ns: int | None = None, *, tolerance_ns: int = 0, epoch: int | None = None
+    ) -> Waiting[T]:
+        """Waits, with its thread, until a version is there or cannot come: `outcome` and `entry` of what is given.
+
+        Args:
+            version: Which one [ns].
+            timeout_ns: How long, by the mesh's clock [ns]; None is until the component stops.
+            tolerance_ns: How far from it the version may be; the nearest of those there is taken [ns].
+            epoch: Of the version; by default as for `access`.
+        """
+        ended = threading.Event()
+        due = None if timeout_ns is None else self.window.clock.monotonic_ns() + timeout_ns
+        waiting = self.when(version, lambda _: ended.set(), due_ns=due, tolerance_ns=tolerance_ns, epoch=epoch)
+        ended.wait()
+        return waiting
+
+    def when(
+        self,
+        version: int,
+        on_end: Callable[[Waiting[T]], None],
+        *,
+        due_ns: int | None = None,
+        tolerance_ns: int = 0,
+        epoch: int | None = None,
+    ) -> Waiting[T]:
+        """Waits without a thread: calls back once, in the thread that ends the wait, which may be this one.
+
+        Args:
+            version: Which one [ns].
+            on_end: Takes the wait, with its outcome.
+            due_ns: When it ends with TIMEOUT, in the clock's `monotonic_ns`; None is never.
+            tolerance_ns: As for `wait`.
+            epoch: As for `access`.
+        """
+        window = self.window
+        timer: list[Timer] = []
+
+        def end(waiting: Waiting[T]) -> None:
+            window.forget(waiting)
+            with self._lock:
+                if self._waits is not None:
+                    self._waits.discard(waiting)
+            for one in timer:
+                one.cancel()
+            on_end(waiting)
+
+        waiting = window.wait(version, end, self.epoch if epoch is None else epoch, tolerance_ns)
+        if waiting.outcome is not None:
+            return waiting
+        with self._lock:
+            stopping = self._waits is None
+            if self._waits is not None and waiting.outcome is None:
+                self._waits.add(waiting)
+        if stopping:
+            waiting.end(Outcome.SHUTDOWN)
+        elif due_ns is not None and due_ns <= window.clock.monotonic_ns():
+            waiting.end(Outcome.TIMEOUT)
+        elif due_ns is not None:
+            timer.append(window.clock.call_at(due_ns, lambda: waiting.end(Outcome.TIMEOUT) and None))
+            if waiting.outcome is not None:  # it ended before there was a timer to cancel
+                timer[0].cancel()
+        return waiting
+
+    def end_waits(self) -> None:
+        """Ends all waits with SHUTDOWN, and those that begin from now on if they are not decided at once."""
+        with self._lock:
+            waits, self._waits = self._waits or set(), None
+        for waiting in waits:
+            waiting.end(Outcome.SHUTDOWN)
+
+    def allow_waits(self) -> None:
+        """Undoes `end_waits`."""
+        with self._lock:
+            if self._waits is None:
+                self._waits = set()
 
 
 class Output(_Handle[T]):
@@ -156,20 +283,44 @@ class Output(_Handle[T]):
 
     def allocate_change(self) -> Change[T]:
         """A new change, to be written and committed."""
-        return Change(self.window)
+        return Change(self.window, self.epoch)
 
-    def commit(self, policy: CommitPolicy, change: Change[T]) -> Status:
+    def commit(
+        self,
+        policy: CommitPolicy | Reorder,
+        change: Change[T],
+        *,
+        equal: EqualVersion = EqualVersion.KEEP_FIRST,
+        triggers: bool | None = None,
+    ) -> Status:
         """Publishes a change; its value is read-only from here on.
+
+        Args:
+            policy: What to do where it is older than the newest.
+            change: Of this output.
+            equal: What to do where there is one of its version.
+            triggers: Whether it starts runs; by default if it becomes the newest.
+
+        Returns:
+            OK, or why it was not kept, which is counted. After REJECTED the change is still open.
 
         Raises:
             RuntimeError: It was committed or abandoned already.
-            ValueError: It has no version or no value.
+            ValueError: It has no version or no value; or `equal` is ERROR, and there is one of its version.
         """
-        return change._commit(policy)
+        return change._commit(policy, equal, triggers)
 
-    def settle(self, version: int) -> None:
+    def settle(self, version: int, epoch: int | None = None) -> None:
         """Says that there will be nothing at `version`."""
-        self.window.settle(version)
+        self.window.settle(version, self.epoch if epoch is None else epoch)
+
+    def new_epoch(self) -> int:
+        """Starts the topic over: versions may begin anew. Gives the epoch, which those who read it take over."""
+        return self.window.new_epoch()
+
+    def flush(self) -> None:
+        """Publishes all that `Reorder` holds back."""
+        self.window.flush()
 
 
 def declared_handles(component: type) -> dict[str, Input | Output]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+from .clock import Clock, SystemClock
 from .counters import LossCounters
 from .window import Window
 
@@ -14,13 +15,18 @@ __all__ = ["DataMesh"]
 class DataMesh:
     """All topics of a process. A topic's window is made when it is first asked for."""
 
-    def __init__(self, window_capacity: int = 32) -> None:
+    def __init__(self, window_capacity: int = 32, *, clock: Clock | None = None, check: bool = False) -> None:
         """Makes an empty mesh.
 
         Args:
             window_capacity: How many versions each window keeps, unless it is made with another number.
+            clock: By which data are stamped, waits end and time triggers come; by default the machine's.
+            check: Payloads are compared with what they were at their commit, when they are released and when they are
+                evicted; what was written to since is counted as `modified`. For tests: it reads every byte.
         """
         self.losses = LossCounters()
+        self.clock = clock if clock is not None else SystemClock()
+        self.check = check
         self._window_capacity = window_capacity
         self._windows: dict[str, Window[Any]] = {}
         self._lock = threading.Lock()
@@ -35,7 +41,8 @@ class DataMesh:
         with self._lock:
             window = self._windows.get(topic)
             if window is None:
-                window = Window(topic, self._window_capacity if capacity is None else capacity, self.losses)
+                capacity = self._window_capacity if capacity is None else capacity
+                window = Window(topic, capacity, self.losses, clock=self.clock, check=self.check)
                 self._windows[topic] = window
             return window
 

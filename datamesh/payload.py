@@ -1,14 +1,16 @@
-"""What the mesh asks of a payload: that it can be made read-only once it is committed."""
+"""What the mesh asks of payloads: to become read-only, to show their bytes, to say when a device has written them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+import zlib
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-__all__ = ["Freezable", "freeze"]
+__all__ = ["Completion", "Freezable", "checksum", "freeze"]
 
 
 @runtime_checkable
@@ -20,21 +22,81 @@ class Freezable(Protocol):
         ...
 
 
+class Completion(Protocol):
+    """The event after which a payload on a device is written: an event of Warp or torch behind two methods."""
+
+    stream: Any
+    """The stream that writes it; who reads on it need not wait."""
+
+    def synchronize(self) -> None:
+        """The calling thread waits for it."""
+        ...
+
+    def wait_on(self, stream: Any) -> None:
+        """What is queued on `stream` from now on waits for it; the calling thread does not."""
+        ...
+
+
+@functools.lru_cache(maxsize=1024)
+def _kind(of: type) -> str:
+    if issubclass(of, np.ndarray):
+        return "array"
+    if callable(getattr(of, "freeze", None)):
+        return "freezable"
+    if dataclasses.is_dataclass(of):
+        return "dataclass"
+    if issubclass(of, Mapping):
+        return "mapping"
+    if issubclass(of, (list, tuple)):
+        return "sequence"
+    if callable(getattr(of, "numpy", None)):
+        return "device array"
+    return "leaf"
+
+
+def _parts(value: Any, kind: str) -> Iterable[Any]:
+    """What a payload consists of."""
+    if kind == "dataclass":
+        return [getattr(value, field.name) for field in dataclasses.fields(value)]
+    if kind == "mapping":
+        return value.values()
+    return value if kind == "sequence" else ()
+
+
 def freeze(value: Any) -> None:
     """Makes a committed payload read-only: NumPy arrays in it refuse to be written from here on.
 
-    Goes through dataclasses, mappings, lists and tuples. Arrays of Warp and torch cannot be protected.
+    Goes through dataclasses, mappings, lists and tuples. Arrays of Warp and torch cannot be protected: a mesh with
+    `check=True` compares their checksums.
     """
-    if isinstance(value, np.ndarray):
+    kind = _kind(type(value))
+    if kind == "leaf" or kind == "device array":
+        return
+    if kind == "array":
         value.setflags(write=False)
-    elif isinstance(value, Freezable):
+    elif kind == "freezable":
         value.freeze()
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for field in dataclasses.fields(value):
-            freeze(getattr(value, field.name))
-    elif isinstance(value, Mapping):
-        for part in value.values():
+    else:
+        for part in _parts(value, kind):
             freeze(part)
-    elif isinstance(value, (list, tuple)):
-        for part in value:
-            freeze(part)
+
+
+def checksum(value: Any, start: int = 0) -> int:
+    """CRC-32 of the bytes of all arrays in a payload, those on a device too, and of its plain numbers and texts."""
+    kind = _kind(type(value))
+    if kind == "freezable" and dataclasses.is_dataclass(value):
+        kind = "dataclass"
+    if kind == "device array":
+        value = (value.detach().cpu() if hasattr(value, "detach") else value).numpy()
+        kind = "array"
+    if kind == "array":
+        if value.dtype.hasobject:
+            return start
+        return zlib.crc32(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data, start)
+    if isinstance(value, (int, float, complex, str, bytes, bool, type(None))):
+        return zlib.crc32(repr(value).encode(), start)
+    if kind == "mapping":
+        start = checksum([str(key) for key in value], start)
+    for part in _parts(value, kind):
+        start = checksum(part, start)
+    return start

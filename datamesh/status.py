@@ -1,10 +1,10 @@
-"""How a commit or a run of a processor ended."""
+"""How a commit, a wait or a run of a processor ended."""
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import Enum, IntEnum
 
-__all__ = ["Status"]
+__all__ = ["Outcome", "Status"]
 
 
 class Status(IntEnum):
@@ -25,3 +25,22 @@ class Status(IntEnum):
     """It raised an exception: the frame is lost, the next one runs."""
     SHUTDOWN = 7
     """The process is stopping."""
+    REJECTED = 8
+    """Older than the newest in the window: the change stays with its writer, who may give it another version."""
+    CUT = 9
+    """Left out, because the frame is past its deadline."""
+
+
+class Outcome(Enum):
+    """How a wait for a version ended."""
+
+    FOUND = "found"
+    """The datum is there."""
+    TIMEOUT = "timeout"
+    """It was not there at the deadline."""
+    EVICTED = "evicted"
+    """The window's history no longer reaches back to it, so it cannot come any more."""
+    SETTLED_EMPTY = "settled empty"
+    """The producer said that there will be nothing."""
+    SHUTDOWN = "shutdown"
+    """Who waited is stopping."""

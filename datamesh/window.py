@@ -1,4 +1,4 @@
-"""The Window, the carrier of data inside the mesh, and the Snapshot, which reads it.
+"""The Window, the carrier of data inside the mesh.
 
 A window is a bounded history, sorted by version, each version at most once. Its state is one immutable object that a
 commit replaces, so a snapshot is one reference: taken in constant time, and unaffected by what is committed later.
@@ -6,168 +6,62 @@ commit replaces, so a snapshot is one reference: taken in constant time, and una
 
 from __future__ import annotations
 
+import logging
 import threading
-from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from enum import Enum, IntEnum
-from typing import Generic, TypeVar
+from bisect import bisect_left, insort
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
 
+from .clock import Clock, SystemClock
 from .counters import LossCounters
-from .payload import freeze
+from .payload import checksum, freeze
+from .policy import CommitPolicy, EqualVersion, Reorder
+from .snapshot import CURRENT_EPOCH, Entry, Snapshot, State
 from .status import Status
+from .waiting import Waiting
 
-__all__ = ["CommitPolicy", "Entry", "Miss", "Snapshot", "Window"]
+__all__ = ["OnCommit", "OnSettle", "Window"]
 
 T = TypeVar("T")
+OnCommit = Callable[[Entry[T]], None]
+OnSettle = Callable[[int, int], None]
+
+_log = logging.getLogger(__name__)
 
 _REMEMBERED = 256
 """How many settled and how many evicted versions a window knows one by one."""
 
 
-class CommitPolicy(IntEnum):
-    """What a commit does when its version is older than the newest in the window."""
+class _Held(NamedTuple):
+    """A datum that `Reorder` holds back."""
 
-    DISCARD_OUT_OF_ORDER = 0
-    """Drops it, counted: the usual one."""
-    INSERT_SORTED = 1
-    """Puts it in its place in the history; it triggers nobody."""
-
-
-class Miss(Enum):
-    """Why a version is not in a snapshot."""
-
-    EVICTED = "evicted"
-    """It is older than the window's history reaches back."""
-    FUTURE = "future"
-    """It is newer than everything committed so far."""
-    NEVER = "never"
-    """It lies within the history, and nothing was committed at it."""
-    SETTLED_EMPTY = "settled empty"
-    """The producer said that there will be nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class Entry(Generic[T]):
-    """One committed datum."""
-
-    version: int
-    """Time of reception of the frame it belongs to [ns]."""
-    value: T
-    received_ns: int
-    """`time.perf_counter_ns` when the sensor's data that it derives from was received."""
-    committed_ns: int
-    """`time.perf_counter_ns` of its own commit."""
-
-
-@dataclass(frozen=True, slots=True)
-class _State(Generic[T]):
-    epoch: int = 0
-    versions: tuple[int, ...] = ()
-    entries: tuple[Entry[T], ...] = ()
-    evicted: int = -1
-    """The highest version that was evicted in this epoch; −1 when none was."""
-    settled: dict[int, None] = field(default_factory=dict)
-
-
-class Snapshot(Generic[T]):
-    """What a window held at one moment, oldest first; immutable."""
-
-    __slots__ = ("_state",)
-
-    def __init__(self, state: _State[T]) -> None:
-        self._state = state
-
-    @property
-    def epoch(self) -> int:
-        """Rises when the clock steps, a recording loops or seeks, or the producer restarts."""
-        return self._state.epoch
-
-    @property
-    def versions(self) -> tuple[int, ...]:
-        """The versions held, ascending."""
-        return self._state.versions
-
-    def __len__(self) -> int:
-        return len(self._state.entries)
-
-    def __getitem__(self, index: int) -> T:
-        """The datum at an index.
-
-        Raises:
-            IndexError: There is none; −1 is what the searches give on a miss, and never the newest.
-        """
-        return self.entry(index).value
-
-    def __iter__(self) -> Iterator[T]:
-        return (entry.value for entry in self._state.entries)
-
-    def entry(self, index: int) -> Entry[T]:
-        """The datum at an index, with its version and times.
-
-        Raises:
-            IndexError: There is none.
-        """
-        if index < 0:
-            raise IndexError(f"snapshot index {index}: the version looked for is not there; `last()` gives the newest")
-        return self._state.entries[index]
-
-    def version_index(self, version: int) -> int:
-        """The index of exactly this version, or −1."""
-        versions = self._state.versions
-        index = bisect_left(versions, version)
-        return index if index < len(versions) and versions[index] == version else -1
-
-    def miss(self, version: int) -> Miss | None:
-        """Why `version` is not here; None when it is."""
-        state = self._state
-        if self.version_index(version) >= 0:
-            return None
-        if version in state.settled:
-            return Miss.SETTLED_EMPTY
-        if version <= state.evicted:
-            return Miss.EVICTED
-        if not state.versions or version > state.versions[-1]:
-            return Miss.FUTURE
-        return Miss.NEVER
-
-    def last(self) -> T:
-        """The newest datum, which need not be that of the trigger: read frame data by its version.
-
-        Raises:
-            LookupError: The window is empty.
-        """
-        if not self._state.entries:
-            raise LookupError("the window is empty: nothing was committed yet")
-        return self._state.entries[-1].value
-
-    def before(self, version: int) -> int:
-        """The index of the newest version < `version`, or −1."""
-        return bisect_left(self._state.versions, version) - 1
-
-    def after(self, version: int) -> int:
-        """The index of the oldest version > `version`, or −1."""
-        index = bisect_right(self._state.versions, version)
-        return index if index < len(self._state.versions) else -1
-
-    def nearest(self, version: int, max_age: int) -> int:
-        """The index of the version nearest to `version` and at most `max_age` [ns] from it, the older of two; or −1."""
-        before, after = bisect_right(self._state.versions, version) - 1, self.after(version)
-        near = [index for index in (before, after) if index >= 0]
-        index = min(near, key=lambda i: abs(self._state.versions[i] - version), default=-1)
-        return index if index >= 0 and abs(self._state.versions[index] - version) <= max_age else -1
+    order: tuple[int, int]
+    due_ns: int
+    entry: Entry
+    equal: EqualVersion
+    triggers: bool | None
 
 
 class Window(Generic[T]):
     """A bounded history of one topic. Many threads may read and commit."""
 
-    def __init__(self, topic: str, capacity: int = 8, losses: LossCounters | None = None) -> None:
+    def __init__(
+        self,
+        topic: str,
+        capacity: int = 8,
+        losses: LossCounters | None = None,
+        *,
+        clock: Clock | None = None,
+        check: bool = False,
+    ) -> None:
         """Makes an empty window.
 
         Args:
             topic: Its name, for messages and counters.
             capacity: How many versions it keeps, ≥ 1; a further one evicts the lowest.
             losses: Where discarded data are counted.
+            clock: By which data are stamped, held back and waited for.
+            check: Payloads are compared with what they were at their commit, when they are released and evicted.
 
         Raises:
             ValueError: `capacity` is below 1.
@@ -177,84 +71,306 @@ class Window(Generic[T]):
         self.topic = topic
         self.capacity = capacity
         self.losses = losses if losses is not None else LossCounters()
-        self._state: _State[T] = _State()
-        self._evicted: dict[int, None] = {}
+        self.clock = clock if clock is not None else SystemClock()
+        self.check = check
+        self._state: State[T] = State.empty(0)
         self._lock = threading.Lock()
         # Held from a commit to the end of its callbacks: subscribers see the commits in their order.
         self._commit_lock = threading.RLock()
-        self._on_commit: list[Callable[[Entry[T]], None]] = []
-        self._on_settle: list[Callable[[int], None]] = []
+        self._on_commit: tuple[OnCommit, ...] = ()
+        self._on_settle: tuple[OnSettle, ...] = ()
+        self._waits: list[Waiting[T]] = []
+        self._held: list[_Held] = []
+        self._modified: set[tuple[int, int]] = set()
 
-    def snapshot(self) -> Snapshot[T]:
-        """What the window holds now."""
-        return Snapshot(self._state)
+    @property
+    def epoch(self) -> int:
+        """The epoch it is in."""
+        return self._state.epoch
 
-    def subscribe(self, on_commit: Callable[[Entry[T]], None], on_settle: Callable[[int], None]) -> None:
-        """Calls back after each commit that triggers, and after each settle, in the committing thread."""
-        with self._lock:
-            self._on_commit.append(on_commit)
-            self._on_settle.append(on_settle)
+    def snapshot(self, epoch: int = CURRENT_EPOCH, stream: Any = None) -> Snapshot[T]:
+        """What the window holds now.
 
-    def commit(self, policy: CommitPolicy, entry: Entry[T]) -> Status:
-        """Adds a datum, read-only from here on, and tells the subscribers.
+        Args:
+            epoch: Whose data; those of the epoch before are there until the current one has filled the window.
+            stream: Where the values will be read, so that it waits for those that a device is still writing. None:
+                on the host, so the calling thread waits.
+        """
+        return Snapshot(self._state.of_epoch(epoch), stream)
 
-        An equal version is kept as it is, and the new one discarded.
+    def subscribe(self, on_commit: OnCommit, on_settle: OnSettle) -> Callable[[], None]:
+        """Calls back after each commit that was kept, and after each settle, in the thread that made it.
+
+        Args:
+            on_commit: Takes the entry; `triggers` in it is false for one put into the history.
+            on_settle: Takes the version and its epoch.
 
         Returns:
-            OK, OUT_OF_ORDER or DUPLICATE; the latter two are counted.
+            Ends the subscription.
+        """
+        with self._lock:
+            self._on_commit = (*self._on_commit, on_commit)
+            self._on_settle = (*self._on_settle, on_settle)
+
+        def unsubscribe() -> None:
+            with self._lock:
+                self._on_commit = tuple(one for one in self._on_commit if one is not on_commit)
+                self._on_settle = tuple(one for one in self._on_settle if one is not on_settle)
+
+        return unsubscribe
+
+    def commit(
+        self,
+        policy: CommitPolicy | Reorder,
+        entry: Entry[T],
+        equal: EqualVersion = EqualVersion.KEEP_FIRST,
+        triggers: bool | None = None,
+    ) -> Status:
+        """Adds a datum, read-only from here on, and tells the subscribers.
+
+        Args:
+            policy: What to do where it is older than the newest. An epoch older than the window's is out of order under
+                every policy; a newer one takes the window into it.
+            entry: The datum.
+            equal: What to do where there is one of its version.
+            triggers: Whether it starts runs; by default if it becomes the newest.
+
+        Returns:
+            OK (also for what is held back to be put in order), OUT_OF_ORDER, DUPLICATE or REJECTED, which are counted.
+
+        Raises:
+            ValueError: There is one of its version, and `equal` is ERROR.
         """
         with self._commit_lock:
-            with self._lock:
-                state = self._state
-                index = bisect_left(state.versions, entry.version)
-                newest = index == len(state.versions)
-                evicts_itself = index == 0 and len(state.versions) == self.capacity
-                if not newest and state.versions[index] == entry.version:
-                    status = Status.DUPLICATE
-                elif not newest and (policy is CommitPolicy.DISCARD_OUT_OF_ORDER or evicts_itself):
-                    status = Status.OUT_OF_ORDER
-                else:
-                    status = Status.OK
-                    freeze(entry.value)
-                    self._insert(state, index, entry)
-            if status:
-                self.losses.count(self.topic, status.name.lower(), entry.version)
-            elif newest:
-                for on_commit in self._on_commit:
-                    on_commit(entry)
-            return status
+            if isinstance(policy, Reorder):
+                return self._hold(policy, entry, equal, triggers)
+            return self._publish(policy, entry, equal, triggers)
 
-    def _insert(self, state: _State[T], index: int, entry: Entry[T]) -> None:
-        versions = (*state.versions[:index], entry.version, *state.versions[index:])
-        entries = (*state.entries[:index], entry, *state.entries[index:])
-        evicted = state.evicted
-        if len(versions) > self.capacity:
-            evicted = versions[0]
-            versions, entries = versions[1:], entries[1:]
-            _remember(self._evicted, evicted)
-        settled = state.settled
-        if entry.version in settled:
-            settled = {version: None for version in settled if version != entry.version}
-        self._state = _State(state.epoch, versions, entries, evicted, settled)
-
-    def settle(self, version: int) -> None:
-        """Says that there will be nothing at `version` and tells the subscribers, unless there is or was something."""
+    def _publish(
+        self, policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool | None = None
+    ) -> Status:
+        """Commits at once. Called with the commit lock held."""
         with self._lock:
             state = self._state
-            if version in state.settled or version in state.versions or version in self._evicted:
+            if entry.epoch == CURRENT_EPOCH:
+                entry = entry._replace(epoch=state.epoch)
+            if entry.epoch > state.epoch:
+                state = self._stepped(entry.epoch)
+            index = len(state.versions)
+            lost: tuple[tuple[str, int], ...] = ()
+            if entry.epoch == state.epoch and (index == 0 or entry.version > state.versions[-1]):
+                status = Status.OK
+                if triggers is not None:
+                    entry = entry._replace(triggers=triggers)
+            else:
+                status, state, index, entry, lost = self._place(state, policy, entry, equal, triggers is True)
+            oldest = None
+            if status is Status.OK:
+                oldest = state.entries[0] if self.check and len(state.entries) == self.capacity else None
+                entry = self._insert(state, index, entry)
+        # Who watches losses may read the window, or write to it: no lock of it is held.
+        if oldest is not None:
+            self.verify(oldest)
+        for reason, version in lost:
+            self.losses.count(self.topic, reason, version)
+        if status is not Status.OK:
+            self.losses.count(self.topic, status.name.lower(), entry.version)
+            if status is Status.DUPLICATE and equal is EqualVersion.ERROR:
+                raise ValueError(f"version {entry.version} is in {self.topic!r} already, and equal versions are errors")
+            return status
+        for on_commit in self._on_commit:
+            try:
+                on_commit(entry)
+            except Exception:  # the others are to be told all the same
+                _log.exception("a subscriber of %s failed at version %d", self.topic, entry.version)
+        if self._waits:
+            self._end_waits()
+        return status
+
+    def _place(
+        self, state: State[T], policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool
+    ) -> tuple[Status, State[T], int, Entry[T], tuple[tuple[str, int], ...]]:
+        """Where a datum that is not the newest goes: status, the state to put it in, index, entry, losses."""
+        refused = Status.REJECTED if policy is CommitPolicy.REJECT else Status.OUT_OF_ORDER
+        if entry.epoch < state.epoch:
+            return refused, state, -1, entry, ()
+        versions = state.versions
+        index = bisect_left(versions, entry.version)
+        if versions[index] == entry.version:
+            if equal is not EqualVersion.REPLACE:
+                return Status.DUPLICATE, state, index, entry, ()
+            lost = (("replaced", entry.version),)
+            return Status.OK, _without(state, index, index + 1), index, entry._replace(triggers=False), lost
+        if policy is CommitPolicy.INSERT_SORTED and (index > 0 or len(versions) < self.capacity):
+            return Status.OK, state, index, entry._replace(triggers=triggers), ()
+        if policy is CommitPolicy.OVERWRITE:
+            lost = tuple(("overwritten", version) for version in versions[index:])
+            return Status.OK, _without(state, index, len(versions)), index, entry, lost
+        if policy is CommitPolicy.FORCE_NEW_EPOCH:
+            return Status.OK, self._stepped(state.epoch + 1), 0, entry._replace(epoch=state.epoch + 1), ()
+        return refused, state, index, entry, ()
+
+    def _insert(self, state: State[T], index: int, entry: Entry[T]) -> Entry[T]:
+        """Puts a datum, made read-only, into a state, and the state into the window."""
+        freeze(entry.value)
+        if self.check:
+            if entry.completion is not None:
+                entry.completion.synchronize()
+            entry = entry._replace(checksum=checksum(entry.value))
+        version, evicted, previous = entry.version, state.evicted, state.previous
+        first = 1 if len(state.versions) >= self.capacity else 0
+        if first:
+            evicted = state.versions[0]
+            _remember(state.gone, evicted)
+            previous = None
+        versions = (*state.versions[first:index], version, *state.versions[index:])
+        entries = (*state.entries[first:index], entry, *state.entries[index:])
+        settled = state.settled
+        if settled and version in settled:
+            settled = {other: None for other in settled if other != version}
+        self._state = State(state.epoch, versions, entries, evicted, settled, state.gone, previous)
+        return entry
+
+    def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
+        """Says that there will be nothing at `version`, unless there is or was something, and tells the subscribers."""
+        if epoch > self._state.epoch:
+            self.new_epoch(epoch)
+        with self._lock:
+            state = self._state.of_epoch(epoch)
+            epoch = state.epoch
+            if version in state.settled or version in state.versions or version in state.gone:
+                return
+            if any(held.order == (epoch, version) for held in self._held):
                 return
             settled = dict(state.settled)
             _remember(settled, version)
-            self._state = _State(state.epoch, state.versions, state.entries, state.evicted, settled)
+            now = State(epoch, state.versions, state.entries, state.evicted, settled, state.gone, state.previous)
+            if state is self._state:
+                self._state = now
+            elif state is self._state.previous:
+                self._state.previous = now
         for on_settle in self._on_settle:
-            on_settle(version)
+            try:
+                on_settle(version, epoch)
+            except Exception:
+                _log.exception("a subscriber of %s failed at the settled version %d", self.topic, version)
+        if self._waits:
+            self._end_waits()
 
-    def new_epoch(self) -> int:
-        """Starts over, empty, in the next epoch: versions may begin anew. Gives the epoch."""
+    def new_epoch(self, epoch: int | None = None) -> int:
+        """Starts over, empty: versions may begin anew. Gives the epoch.
+
+        Args:
+            epoch: Which; by default the next. One that the window has reached already changes nothing.
+        """
+        with self._commit_lock:
+            self.flush()
+            with self._lock:
+                self._state = self._stepped(self._state.epoch + 1 if epoch is None else epoch)
+                epoch = self._state.epoch
+            if self._waits:
+                self._end_waits()
+            return epoch
+
+    def _stepped(self, epoch: int) -> State[T]:
+        """The state with which an epoch begins; the window's own where it is there already."""
+        state = self._state
+        if epoch <= state.epoch:
+            return state
+        previous = State(state.epoch, state.versions, state.entries, state.evicted, state.settled, state.gone, None)
+        return State.empty(epoch, previous)
+
+    def wait(
+        self, version: int, on_end: Callable[[Waiting[T]], None], epoch: int = CURRENT_EPOCH, tolerance_ns: int = 0
+    ) -> Waiting[T]:
+        """Waits for a version, without a thread: calls back once, at once if it is decided already.
+
+        Who lets it end otherwise, at a deadline, calls `Waiting.end` and then `forget`.
+        """
+        waiting: Waiting[T] = Waiting(version, self.epoch if epoch == CURRENT_EPOCH else epoch, tolerance_ns, on_end)
         with self._lock:
-            self._evicted.clear()
-            self._state = _State(epoch=self._state.epoch + 1)
-            return self._state.epoch
+            decided = waiting.decide(self._state)
+            if decided is None:
+                self._waits.append(waiting)
+        if decided is not None:
+            waiting.end(*decided)
+        return waiting
+
+    def forget(self, waiting: Waiting[T]) -> None:
+        """Lets go of a wait that has ended."""
+        with self._lock:
+            if waiting in self._waits:
+                self._waits.remove(waiting)
+
+    def _end_waits(self) -> None:
+        ended = []
+        with self._lock:
+            for waiting in tuple(self._waits):
+                decided = waiting.decide(self._state)
+                if decided is not None:
+                    self._waits.remove(waiting)
+                    ended.append((waiting, decided))
+        for waiting, decided in ended:
+            waiting.end(*decided)
+
+    def _hold(self, policy: Reorder, entry: Entry[T], equal: EqualVersion, triggers: bool | None) -> Status:
+        """Holds a datum back until its turn, or commits it where that has passed."""
+        state = self._state
+        if entry.epoch == CURRENT_EPOCH:
+            entry = entry._replace(epoch=max([state.epoch, *(held.entry.epoch for held in self._held)]))
+        order = (entry.epoch, entry.version)
+        newest = (state.epoch, state.versions[-1] if state.versions else -1)
+        if order <= newest:
+            return self._publish(CommitPolicy.DISCARD_OUT_OF_ORDER, entry, equal, triggers)
+        due = self.clock.monotonic_ns() + policy.delay_ns
+        same = next((held for held in self._held if held.order == order), None)
+        if same is not None:
+            if equal is not EqualVersion.REPLACE:
+                self.losses.count(self.topic, "duplicate", entry.version)
+                if equal is EqualVersion.ERROR:
+                    raise ValueError(f"version {entry.version} of {self.topic!r} is held back already")
+                return Status.DUPLICATE
+            self.losses.count(self.topic, "replaced", entry.version)
+            self._held.remove(same)
+            due = same.due_ns
+        freeze(entry.value)
+        insort(self._held, _Held(order, due, entry, equal, triggers), key=lambda held: held.order)
+        self._release(len(self._held) - policy.depth)
+        if self._held and same is None:
+            self.clock.call_at(due, self._release_due)
+        return Status.OK
+
+    def _release_due(self) -> None:
+        """Publishes what was held long enough, and what comes before it."""
+        with self._commit_lock:
+            now = self.clock.monotonic_ns()
+            self._release(max((number for number, held in enumerate(self._held, 1) if held.due_ns <= now), default=0))
+
+    def _release(self, count: int) -> None:
+        for _ in range(count):
+            held = self._held.pop(0)
+            self._publish(CommitPolicy.DISCARD_OUT_OF_ORDER, held.entry, held.equal, held.triggers)
+
+    def flush(self) -> None:
+        """Publishes all that `Reorder` holds back."""
+        with self._commit_lock:
+            self._release(len(self._held))
+
+    def verify(self, entry: Entry[T]) -> None:
+        """Counts a datum, once, whose payload is not what it was at its commit: somebody wrote to it."""
+        if entry.checksum is None or checksum(entry.value) == entry.checksum:
+            return
+        order = (entry.epoch, entry.version)
+        if order not in self._modified:
+            self._modified.add(order)
+            self.losses.count(self.topic, "modified", entry.version)
+            _log.error("%s: the payload of version %d was written to after its commit", self.topic, entry.version)
+
+
+def _without(state: State[T], start: int, end: int) -> State[T]:
+    versions = state.versions[:start] + state.versions[end:]
+    entries = state.entries[:start] + state.entries[end:]
+    return State(state.epoch, versions, entries, state.evicted, state.settled, state.gone, state.previous)
 
 
 def _remember(versions: dict[int, None], version: int) -> None:

@@ -28,7 +28,7 @@ class Topic:
             self.events.append(entry.version)
             self._changed.notify_all()
 
-    def _on_settle(self, version):
+    def _on_settle(self, version, epoch):
         with self._changed:
             self.settled.append(version)
             self.events.append(version)

@@ -290,7 +290,8 @@ def test_a_trigger_evicted_before_it_ran_is_counted_and_settled(topic, started):
     assert mesh.losses.as_dict() == {"dag": {"trigger evicted": 1}}
 
 
-def test_a_late_insertion_into_the_history_triggers_nobody(topic, started):
+def test_a_late_insertion_into_the_history_runs_nothing_and_is_settled(topic, started):
+    """Whoever waits for the version learns that nothing will come of it."""
     mesh = DataMesh()
     given, result = topic(mesh.window("input")), topic(mesh.window("output"))
     started(dag(mesh, same))
@@ -298,8 +299,9 @@ def test_a_late_insertion_into_the_history_triggers_nobody(topic, started):
     given.commit(30, "b")
     assert given.commit(20, "late", CommitPolicy.INSERT_SORTED) is Status.OK
     given.commit(40, "c")
-    result.wait_for(10, 30, 40)
-    assert result.events == [10, 30, 40]
+    result.wait_for(10, 20, 30, 40)
+    assert result.entries == {10: "a", 30: "b", 40: "c"}
+    assert result.settled == [20]
 
 
 def test_stop_finishes_what_waits(topic):
