@@ -19,9 +19,10 @@ import warp as wp
 
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
-from .ground_plane import FIRST_RING, RING_BITS, RINGS, SEGMENTS, GroundPlane, above, cell_of, lowest_point
+from .ground_plane import FIRST_RING, RING_BITS, RINGS, SEGMENTS, GroundPlane, above, cell_of, lowest_point, part_end
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .threads import launch_parts
 
 __all__ = ["Ground", "GroundSegment", "elevation_grid", "segment_ground"]
 
@@ -49,19 +50,16 @@ _BOTTOM_PER_METRE = wp.constant(0.02)
 _FARTHEST = wp.constant(65536.0)  # r² where the last ring ends
 
 
-@wp.kernel
-def _sweep_segments(
-    # in
+@wp.func
+def _sweep(
+    segment: int,
     xyz_in: wp.array(dtype=wp.vec3),
     cells_in: wp.array2d(dtype=wp.int64),
-    plane_in: wp.array(dtype=wp.vec3),
+    plane: wp.vec3,
     radius_in: wp.array(dtype=wp.float32),
-    # out
     rise_out: wp.array(dtype=wp.float32),
 ):
     """Walks a segment outwards over its samples; out: how far the surface rises above the plane in each cell."""
-    segment = wp.tid()
-    plane = plane_in[0]
     first = segment * RINGS
     last_r = wp.float32(_START)
     last_rise = wp.float32(0.0)
@@ -103,6 +101,37 @@ def _sweep_segments(
         rise_out[first + k] = last_rise + slope * wp.clamp(radius_in[k] - last_r, 0.0, _EXTEND)
 
 
+@wp.kernel
+def _sweep_segments(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells_in: wp.array2d(dtype=wp.int64),
+    plane_in: wp.array(dtype=wp.vec3),
+    radius_in: wp.array(dtype=wp.float32),
+    # out
+    rise_out: wp.array(dtype=wp.float32),
+):
+    """One segment a thread."""
+    _sweep(wp.tid(), xyz_in, cells_in, plane_in[0], radius_in, rise_out)
+
+
+@wp.kernel
+def _sweep_part(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells_in: wp.array2d(dtype=wp.int64),
+    plane_in: wp.array(dtype=wp.vec3),
+    radius_in: wp.array(dtype=wp.float32),
+    # out
+    rise_out: wp.array(dtype=wp.float32),
+):
+    """Some of the segments."""
+    for segment in range(part_end(SEGMENTS, part - 1, parts), part_end(SEGMENTS, part, parts)):
+        _sweep(segment, xyz_in, cells_in, plane_in[0], radius_in, rise_out)
+
+
 @wp.func
 def _median5(a: float, b: float, c: float, d: float, e: float) -> float:
     low = wp.max(wp.min(a, b), wp.min(c, d))
@@ -132,6 +161,32 @@ def _reconciled(rise: wp.array(dtype=wp.float32), radius: wp.array(dtype=wp.floa
     )
 
 
+@wp.func
+def _judge_cell(
+    cell: int,
+    cells_in: wp.array2d(dtype=wp.int64),
+    rise_in: wp.array(dtype=wp.float32),
+    radius_in: wp.array(dtype=wp.float32),
+    centre_in: wp.array(dtype=wp.vec2),
+    plane: wp.vec3,
+    surface_out: wp.array(dtype=wp.vec4),
+):
+    """Of a cell with points: the rise of its surface as u + v r², and the heights between which points are ground."""
+    if cells_in[cell, 0] == wp.int64(0):
+        return
+    surface = _reconciled(rise_in, radius_in, cell)
+    r = radius_in[cell & (RINGS - 1)]
+    centre = centre_in[cell]
+    z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
+    # A wall, a car, a trunk stands on the cell if the levels above its surface have points.
+    level = wp.uint64(int(wp.ceil((1000.0 + wp.clamp(z, -900.0, 900.0) + _STANDS_FROM) * 4.0)) & 63)
+    levels = wp.uint64(cells_in[cell, 1])
+    levels = (levels >> level) | (levels << ((wp.uint64(64) - level) & wp.uint64(63)))
+    top = wp.where((levels & _STANDS_LEVELS) == wp.uint64(0), _TOP_BARE, _TOP_OCCUPIED)
+    half = 0.5 * surface[1]
+    surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
+
+
 @wp.kernel
 def _judge_cells(
     # in
@@ -143,22 +198,51 @@ def _judge_cells(
     # out
     surface_out: wp.array(dtype=wp.vec4),
 ):
-    """Per cell with points: the rise of its surface as u + v r², and the heights between which points are ground."""
-    cell = wp.tid()
-    if cells_in[cell, 0] == wp.int64(0):
+    """One cell a thread."""
+    _judge_cell(wp.tid(), cells_in, rise_in, radius_in, centre_in, plane_in[0], surface_out)
+
+
+@wp.kernel
+def _judge_cells_part(
+    # in
+    part: int,
+    parts: int,
+    cells_in: wp.array2d(dtype=wp.int64),
+    rise_in: wp.array(dtype=wp.float32),
+    radius_in: wp.array(dtype=wp.float32),
+    centre_in: wp.array(dtype=wp.vec2),
+    plane_in: wp.array(dtype=wp.vec3),
+    # out
+    surface_out: wp.array(dtype=wp.vec4),
+):
+    """Some of the cells."""
+    size = SEGMENTS * RINGS
+    for cell in range(part_end(size, part - 1, parts), part_end(size, part, parts)):
+        _judge_cell(cell, cells_in, rise_in, radius_in, centre_in, plane_in[0], surface_out)
+
+
+@wp.func
+def _judge_point(
+    i: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    cell_in: wp.array(dtype=wp.int32),
+    plane: wp.vec3,
+    surface_in: wp.array(dtype=wp.vec4),
+    mask_out: wp.array(dtype=wp.bool),
+    height_out: wp.array(dtype=wp.float32),
+):
+    """The height of a point above the surface of its cell, and whether that is ground."""
+    cell = cell_in[i]
+    if cell < 0:
+        mask_out[i] = False
+        height_out[i] = wp.nan
         return
-    surface = _reconciled(rise_in, radius_in, cell)
-    r = radius_in[cell & (RINGS - 1)]
-    centre = centre_in[cell]
-    plane = plane_in[0]
-    z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
-    # A wall, a car, a trunk stands on the cell if the levels above its surface have points.
-    level = wp.uint64(int(wp.ceil((1000.0 + wp.clamp(z, -900.0, 900.0) + _STANDS_FROM) * 4.0)) & 63)
-    levels = wp.uint64(cells_in[cell, 1])
-    levels = (levels >> level) | (levels << ((wp.uint64(64) - level) & wp.uint64(63)))
-    top = wp.where((levels & _STANDS_LEVELS) == wp.uint64(0), _TOP_BARE, _TOP_OCCUPIED)
-    half = 0.5 * surface[1]
-    surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
+    p = xyz_in[i]
+    surface = surface_in[cell]
+    r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
+    height = above(plane, p) - surface[0] - surface[1] * r2
+    height_out[i] = height
+    mask_out[i] = height < surface[2] and height > surface[3]
 
 
 @wp.kernel
@@ -173,21 +257,31 @@ def _judge_points(
     mask_out: wp.array(dtype=wp.bool),
     height_out: wp.array(dtype=wp.float32),
 ):
-    """The height of each point above the surface of its cell, and whether that is ground."""
+    """One point a thread."""
     i = wp.tid()
-    if i >= count_in[0]:
-        return
-    cell = cell_in[i]
-    if cell < 0:
-        mask_out[i] = False
-        height_out[i] = wp.nan
-        return
-    p = xyz_in[i]
-    surface = surface_in[cell]
-    r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
-    height = above(plane_in[0], p) - surface[0] - surface[1] * r2
-    height_out[i] = height
-    mask_out[i] = height < surface[2] and height > surface[3]
+    if i < count_in[0]:
+        _judge_point(i, xyz_in, cell_in, plane_in[0], surface_in, mask_out, height_out)
+
+
+@wp.kernel
+def _judge_points_part(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    cell_in: wp.array(dtype=wp.int32),
+    plane_in: wp.array(dtype=wp.vec3),
+    surface_in: wp.array(dtype=wp.vec4),
+    # out
+    mask_out: wp.array(dtype=wp.bool),
+    height_out: wp.array(dtype=wp.float32),
+):
+    """Some of the points."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    plane = plane_in[0]
+    for i in range(part_end(n, part - 1, parts), part_end(n, part, parts)):
+        _judge_point(i, xyz_in, cell_in, plane, surface_in, mask_out, height_out)
 
 
 @wp.kernel
@@ -227,6 +321,8 @@ class GroundSegment:
     """Edge of a square of the elevation grid [m]."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """As for `GroundPlane`."""
 
     mask: wp.array = field(init=False, repr=False)
     """Whether each point is ground, shape (capacity,), bool."""
@@ -245,7 +341,9 @@ class GroundSegment:
         xmin, ymin, xmax, ymax = self.grid_range
         if not (xmin < xmax and ymin < ymax):
             raise ValueError(f"grid_range must be xmin ymin xmax ymax with min < max, not {self.grid_range}")
-        fit = GroundPlane(capacity=self.capacity, sensor_height=self.sensor_height, device=self.device)
+        fit = GroundPlane(
+            capacity=self.capacity, sensor_height=self.sensor_height, device=self.device, method=self.method
+        )
         device = resolve_device(self.device)
         squares = (max(1, round((xmax - xmin) / self.cell_size)), max(1, round((ymax - ymin) / self.cell_size)))
 
@@ -292,14 +390,17 @@ class GroundSegment:
     def _launch_into(self, xyz: wp.array, count: wp.array, mask: wp.array, height: wp.array) -> None:
         fit = self._fit
         fit.launch(xyz, count)
-        self._run(_sweep_segments, int(SEGMENTS), [xyz, fit.cells, fit.plane, self._radius], [self._rise])
-        self._run(
-            _judge_cells,
-            int(SEGMENTS * RINGS),
-            [fit.cells, self._rise, self._radius, self._centre, fit.plane],
-            [self._surface],
-        )
-        self._run(_judge_points, xyz.shape[0], [xyz, count, fit.cell, fit.plane, self._surface], [mask, height])
+        sweep = [xyz, fit.cells, fit.plane, self._radius]
+        cells = [fit.cells, self._rise, self._radius, self._centre, fit.plane]
+        points = [xyz, count, fit.cell, fit.plane, self._surface]
+        if fit.parts:
+            launch_parts(_sweep_part, fit.parts, sweep, [self._rise])
+            launch_parts(_judge_cells_part, fit.parts, cells, [self._surface])
+            launch_parts(_judge_points_part, fit.parts, points, [mask, height])
+            return
+        self._run(_sweep_segments, int(SEGMENTS), sweep, [self._rise])
+        self._run(_judge_cells, int(SEGMENTS * RINGS), cells, [self._surface])
+        self._run(_judge_points, xyz.shape[0], points, [mask, height])
 
 
 def _grid_centres() -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,9 @@
 
 The lowest point of each cell is a sample of the surface. The lowest of each of 256 patches near the sensor are the
 candidates for the plane: RANSAC with draws by a fixed hash, then least squares over the winner's inliers.
+
+A GPU bins all points at once. A CPU bins them in parts, each into a table of its own, and merges the tables; what is
+kept of a cell is a maximum and a union, so the bytes are the same.
 """
 
 from __future__ import annotations
@@ -13,8 +16,19 @@ from typing import Any
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
+from .threads import launch_parts, thread_count
 
-__all__ = ["FIRST_RING", "RINGS", "RING_BITS", "SEGMENTS", "GroundPlane", "above", "cell_of", "lowest_point"]
+__all__ = [
+    "FIRST_RING",
+    "RINGS",
+    "RING_BITS",
+    "SEGMENTS",
+    "GroundPlane",
+    "above",
+    "cell_of",
+    "lowest_point",
+    "part_end",
+]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -27,6 +41,7 @@ RING_BITS = wp.constant(20)
 FIRST_RING = wp.constant(127 * 8)  # the upper bits of 1 m²
 
 # The patches whose lowest points the plane is fitted to: 32 sectors, 8 octaves of r² from 2 to 32 m.
+_SECTORS = wp.constant(32)
 _BANDS = wp.constant(8)
 _CANDIDATES = wp.constant(256)
 _FIRST_BAND_RING = wp.constant(16)
@@ -53,6 +68,24 @@ def cell_of(x: float, y: float) -> int:
     return segment * RINGS + wp.clamp(ring, 0, RINGS - 1)
 
 
+@wp.func
+def _is_finite(p: wp.vec3) -> bool:
+    return wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) < 3.0e38
+
+
+@wp.func
+def _depth_key(z: float, i: int) -> wp.int64:
+    """Grows with the depth of a point below 1000 m, in millimetres; of equals, the first has the highest."""
+    depth = wp.int64(int((1000.0 - z) * 1000.0))
+    return (depth << wp.int64(32)) | (_LOW_WORD - wp.int64(i))
+
+
+@wp.func
+def _level_bit(z: float) -> wp.int64:
+    """The level of 0.25 m, modulo 16 m."""
+    return wp.int64(1) << wp.int64(int((1000.0 + z) * 4.0) & 63)
+
+
 @wp.kernel
 def _bin_points(
     # in
@@ -63,21 +96,52 @@ def _bin_points(
     # out
     cell_out: wp.array(dtype=wp.int32),
 ):
-    """The cell of each point; per cell its lowest point, and the levels of 0.25 m (modulo 16 m) that have points."""
+    """The cell of each point; per cell its lowest point, and the levels that have points."""
     i = wp.tid()
     if i >= count_in[0]:
         return
     p = xyz_in[i]
-    if not (wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) < 3.0e38):
+    if not _is_finite(p):
         cell_out[i] = -1
         return
     cell = cell_of(p[0], p[1])
     cell_out[i] = cell
     z = wp.clamp(p[2], -999.0, 999.0)
-    depth = wp.int64(int((1000.0 - z) * 1000.0))
-    wp.atomic_max(cells, cell, 0, (depth << wp.int64(32)) | (_LOW_WORD - wp.int64(i)))
-    level = int((1000.0 + z) * 4.0) & 63
-    wp.atomic_or(cells, cell, 1, wp.int64(1) << wp.int64(level))
+    wp.atomic_max(cells, cell, 0, _depth_key(z, i))
+    wp.atomic_or(cells, cell, 1, _level_bit(z))
+
+
+@wp.func
+def part_end(length: int, part: int, parts: int) -> int:
+    """Where part `part` of so many equal ones ends, and the next begins."""
+    return int(wp.int64(length) * wp.int64(part + 1) / wp.int64(parts))
+
+
+@wp.kernel
+def _bin_part(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    # in out: zero
+    tables: wp.array2d(dtype=wp.int64),
+    # out
+    cell_out: wp.array(dtype=wp.int32),
+):
+    """The same of one part of the points, whose table is one of those that lie below each other."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    base = part * SEGMENTS * RINGS
+    for i in range(part_end(n, part - 1, parts), part_end(n, part, parts)):
+        p = xyz_in[i]
+        cell = int(-1)
+        if _is_finite(p):
+            cell = cell_of(p[0], p[1])
+            row = base + cell
+            z = wp.clamp(p[2], -999.0, 999.0)
+            tables[row, 0] = wp.max(tables[row, 0], _depth_key(z, i))
+            tables[row, 1] = tables[row, 1] | _level_bit(z)
+        cell_out[i] = cell
 
 
 @wp.func
@@ -86,26 +150,55 @@ def lowest_point(xyz: wp.array(dtype=wp.vec3), key: wp.int64) -> wp.vec3:
     return xyz[int(_LOW_WORD - (key & _LOW_WORD))]
 
 
+@wp.func
+def _candidate_of(xyz: wp.array(dtype=wp.vec3), cells: wp.array2d(dtype=wp.int64), patch: int) -> wp.vec4:
+    """The lowest point of a patch, and how far a plane may lie off it."""
+    sector = patch / _BANDS
+    band = patch % _BANDS
+    best = wp.int64(0)
+    for s in range(8):
+        for k in range(8):
+            best = wp.max(best, cells[(sector * 8 + s) * RINGS + _FIRST_BAND_RING + band * 8 + k, 0])
+    if best == wp.int64(0):
+        return wp.vec4(0.0, 0.0, _NOWHERE, 0.0)
+    p = lowest_point(xyz, best)
+    return wp.vec4(p[0], p[1], p[2], 0.1 + 0.01 * wp.sqrt(p[0] * p[0] + p[1] * p[1]))
+
+
 @wp.kernel
 def _pick_candidates(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     cells_in: wp.array2d(dtype=wp.int64),
     # out
-    candidate_out: wp.array(dtype=wp.vec3),
+    candidate_out: wp.array(dtype=wp.vec4),
 ):
-    """The lowest point of each patch around the sensor."""
+    """The candidates of all patches around the sensor."""
     patch = wp.tid()
-    sector = patch / _BANDS
-    band = patch % _BANDS
-    best = wp.int64(0)
-    for s in range(8):
-        for k in range(8):
-            best = wp.max(best, cells_in[(sector * 8 + s) * RINGS + _FIRST_BAND_RING + band * 8 + k, 0])
-    if best == wp.int64(0):
-        candidate_out[patch] = wp.vec3(0.0, 0.0, _NOWHERE)
-    else:
-        candidate_out[patch] = lowest_point(xyz_in, best)
+    candidate_out[patch] = _candidate_of(xyz_in, cells_in, patch)
+
+
+@wp.kernel
+def _merge_part(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    # in out: the tables of the parts, of which the first becomes that of all
+    tables: wp.array2d(dtype=wp.int64),
+    # out
+    candidate_out: wp.array(dtype=wp.vec4),
+):
+    """Merges the cells of some sectors and picks the candidates there."""
+    size = SEGMENTS * RINGS
+    first = part_end(_SECTORS, part - 1, parts)
+    last = part_end(_SECTORS, part, parts)
+    for other in range(1, parts):
+        for cell in range(first * 8 * RINGS, last * 8 * RINGS):
+            tables[cell, 0] = wp.max(tables[cell, 0], tables[other * size + cell, 0])
+            tables[cell, 1] = tables[cell, 1] | tables[other * size + cell, 1]
+    for patch in range(first * _BANDS, last * _BANDS):
+        candidate_out[patch] = _candidate_of(xyz_in, tables, patch)
 
 
 @wp.func
@@ -115,12 +208,12 @@ def above(plane: wp.vec3, p: wp.vec3) -> float:
 
 
 @wp.func
-def _plane_tolerance(p: wp.vec3) -> float:
-    return 0.1 + 0.01 * wp.sqrt(p[0] * p[0] + p[1] * p[1])
+def _position(candidate: wp.vec4) -> wp.vec3:
+    return wp.vec3(candidate[0], candidate[1], candidate[2])
 
 
 @wp.func
-def _hypothesis(candidates: wp.array(dtype=wp.vec3), number: int) -> wp.vec3:
+def _hypothesis(candidates: wp.array(dtype=wp.vec4), number: int) -> wp.vec3:
     """The plane a b c through three candidates drawn by a fixed hash; c is nowhere if they give none."""
     state = wp.uint32(number) * _HASH + wp.uint32(12345)
     p = wp.vec3(0.0, 0.0, _NOWHERE)
@@ -130,7 +223,7 @@ def _hypothesis(candidates: wp.array(dtype=wp.vec3), number: int) -> wp.vec3:
     while drawn < _DRAWS and s[2] == _NOWHERE:
         drawn += 1
         state = state * wp.uint32(1664525) + wp.uint32(1013904223)
-        candidate = candidates[int(state >> wp.uint32(24))]
+        candidate = _position(candidates[int(state >> wp.uint32(24))])
         if candidate[2] != _NOWHERE:
             if p[2] == _NOWHERE:
                 p = candidate
@@ -149,50 +242,47 @@ def _hypothesis(candidates: wp.array(dtype=wp.vec3), number: int) -> wp.vec3:
     return wp.vec3(a, b, p[2] - a * p[0] - b * p[1])
 
 
+@wp.func
+def _vote(candidates: wp.array(dtype=wp.vec4), number: int, sensor_height: float) -> wp.int64:
+    """A hypothesis and its score, the candidates on it less those under it; zero where it is out of the question."""
+    plane = _hypothesis(candidates, number)
+    if plane[2] == _NOWHERE or plane[0] * plane[0] + plane[1] * plane[1] > _STEEPEST * _STEEPEST:
+        return wp.int64(0)
+    if wp.abs(plane[2] + sensor_height) > _HEIGHT_SLACK:  # never where the height is not given, NaN
+        return wp.int64(0)
+    score = wp.int32(0)
+    for j in range(_CANDIDATES):
+        candidate = candidates[j]
+        off = above(plane, _position(candidate))
+        score += wp.where(wp.abs(off) < candidate[3], 2, wp.where(off < 0.0, -1, 0))
+    if score <= 0:
+        return wp.int64(0)
+    return (wp.int64(score) << wp.int64(32)) | wp.int64(_HYPOTHESES - number)
+
+
 @wp.kernel
 def _vote_planes(
     # in
-    candidate_in: wp.array(dtype=wp.vec3),
+    candidate_in: wp.array(dtype=wp.vec4),
     sensor_height: float,
     # in out: zero
     best: wp.array(dtype=wp.int64),
 ):
-    """Scores a hypothesis by the candidates on it, less those under it."""
-    number = wp.tid()
-    plane = _hypothesis(candidate_in, number)
-    if plane[2] == _NOWHERE or plane[0] * plane[0] + plane[1] * plane[1] > _STEEPEST * _STEEPEST:
-        return
-    if wp.abs(plane[2] + sensor_height) > _HEIGHT_SLACK:  # never where the height is not given, NaN
-        return
-    score = wp.int32(0)
-    for j in range(_CANDIDATES):
-        p = candidate_in[j]
-        off = above(plane, p)
-        if wp.abs(off) < _plane_tolerance(p):
-            score += 2
-        elif off < 0.0:
-            score -= 1
-    if score > 0:
-        wp.atomic_max(best, 0, (wp.int64(score) << wp.int64(32)) | wp.int64(_HYPOTHESES - number))
+    """Finds the best hypothesis, of equals the first."""
+    vote = _vote(candidate_in, wp.tid(), sensor_height)
+    if vote > wp.int64(0):
+        wp.atomic_max(best, 0, vote)
 
 
-@wp.kernel
-def _sum_inliers(
-    # in
-    candidate_in: wp.array(dtype=wp.vec3),
-    best_in: wp.array(dtype=wp.int64),
-    # in out: zero
-    sums: wp.array(dtype=wp.int64),
-):
-    """Normal equations of the least-squares plane through the winner's candidates, in fixed point."""
-    if best_in[0] == wp.int64(0):
-        return
-    plane = _hypothesis(candidate_in, _HYPOTHESES - int(best_in[0] & _LOW_WORD))
-    p = candidate_in[wp.tid()]
-    off = above(plane, p)
-    if wp.abs(off) < _plane_tolerance(p):
-        x = wp.float64(p[0])
-        y = wp.float64(p[1])
+@wp.func
+def _add_inlier(candidates: wp.array(dtype=wp.vec4), number: int, best: wp.int64, sums: wp.array(dtype=wp.int64)):
+    """Adds a candidate that is on the winner to the normal equations of the least-squares plane, in fixed point."""
+    plane = _hypothesis(candidates, _HYPOTHESES - int(best & _LOW_WORD))
+    candidate = candidates[number]
+    off = above(plane, _position(candidate))
+    if wp.abs(off) < candidate[3]:
+        x = wp.float64(candidate[0])
+        y = wp.float64(candidate[1])
         z = wp.float64(off)
         wp.atomic_add(sums, 0, wp.int64(1))
         wp.atomic_add(sums, 1, wp.int64(x * _FIX))
@@ -205,17 +295,30 @@ def _sum_inliers(
         wp.atomic_add(sums, 8, wp.int64(y * z * _FIX))
 
 
+@wp.kernel
+def _sum_inliers(
+    # in
+    candidate_in: wp.array(dtype=wp.vec4),
+    best_in: wp.array(dtype=wp.int64),
+    # in out: zero
+    sums: wp.array(dtype=wp.int64),
+):
+    """The normal equations, one candidate a thread."""
+    if best_in[0] != wp.int64(0):
+        _add_inlier(candidate_in, wp.tid(), best_in[0], sums)
+
+
 @wp.func
 def _fitted_plane(
-    candidates: wp.array(dtype=wp.vec3),
-    best: wp.array(dtype=wp.int64),
+    candidates: wp.array(dtype=wp.vec4),
+    best: wp.int64,
     sums: wp.array(dtype=wp.int64),
     sensor_height: float,
 ) -> wp.vec3:
     """The winner's plane after the fit, or the level one at the height given or usual if there is no winner."""
-    if best[0] == wp.int64(0):
+    if best == wp.int64(0):
         return wp.vec3(0.0, 0.0, -wp.where(wp.isnan(sensor_height), _DEFAULT_HEIGHT, sensor_height))
-    plane = _hypothesis(candidates, _HYPOTHESES - int(best[0] & _LOW_WORD))
+    plane = _hypothesis(candidates, _HYPOTHESES - int(best & _LOW_WORD))
     n = wp.float64(sums[0]) * _FIX
     x = wp.float64(sums[1]) / n
     y = wp.float64(sums[2]) / n
@@ -233,10 +336,16 @@ def _fitted_plane(
     return plane + wp.vec3(float(a), float(b), float(z - a * x - b * y))
 
 
+@wp.func
+def _settle(plane: wp.vec3, plane_out: wp.array(dtype=wp.vec3), found_height_out: wp.array(dtype=wp.float32)):
+    plane_out[0] = plane
+    found_height_out[0] = -plane[2] / wp.sqrt(1.0 + plane[0] * plane[0] + plane[1] * plane[1])
+
+
 @wp.kernel
 def _settle_plane(
     # in
-    candidate_in: wp.array(dtype=wp.vec3),
+    candidate_in: wp.array(dtype=wp.vec4),
     best_in: wp.array(dtype=wp.int64),
     sums_in: wp.array(dtype=wp.int64),
     sensor_height: float,
@@ -245,9 +354,28 @@ def _settle_plane(
     found_height_out: wp.array(dtype=wp.float32),
 ):
     """The plane, and how far the origin is from it."""
-    plane = _fitted_plane(candidate_in, best_in, sums_in, sensor_height)
-    plane_out[0] = plane
-    found_height_out[0] = -plane[2] / wp.sqrt(1.0 + plane[0] * plane[0] + plane[1] * plane[1])
+    _settle(_fitted_plane(candidate_in, best_in[0], sums_in, sensor_height), plane_out, found_height_out)
+
+
+@wp.kernel
+def _fit_in_order(
+    # in
+    candidate_in: wp.array(dtype=wp.vec4),
+    sensor_height: float,
+    # in out: zero
+    sums: wp.array(dtype=wp.int64),
+    # out
+    plane_out: wp.array(dtype=wp.vec3),
+    found_height_out: wp.array(dtype=wp.float32),
+):
+    """Votes, sums and settles, by one thread."""
+    best = wp.int64(0)
+    for number in range(_HYPOTHESES):
+        best = wp.max(best, _vote(candidate_in, number, sensor_height))
+    if best > wp.int64(0):
+        for number in range(_CANDIDATES):
+            _add_inlier(candidate_in, number, best, sums)
+    _settle(_fitted_plane(candidate_in, best, sums, sensor_height), plane_out, found_height_out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +388,13 @@ class GroundPlane:
     """Height of the frame's origin above the ground [m], held to within 0.5 m; None to estimate it in each launch."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`parts` (of a CPU, one for each thread), `shared` (parallel), or `auto`: `parts` on a CPU, else `shared`.
 
+    The results are equal."""
+
+    parts: int = field(init=False, repr=False)
+    """In how many parts a CPU works; 0 where the work is shared."""
     cell: wp.array = field(init=False, repr=False)
     """The polar cell of each point, segment × rings + ring, −1 if it is not finite; shape (capacity,), int32."""
     cells: wp.array = field(init=False, repr=False)
@@ -283,13 +417,19 @@ class GroundPlane:
         def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
             keep(name, wp.zeros(shape, dtype=dtype, device=device))
 
+        if self.method not in ("auto", "parts", "shared"):
+            raise ValueError(f"method must be 'auto', 'parts' or 'shared', not {self.method!r}")
+        in_parts = self.method == "parts" or (self.method == "auto" and device == DEFAULT_DEVICE)
+        parts = thread_count() if in_parts else 1
+        keep("parts", parts if in_parts else 0)
         size = int(SEGMENTS * RINGS)
-        # One array of what each launch clears: per cell two words, the best hypothesis, the sums of the fit.
-        buffer("_scratch", 2 * size + 10, wp.int64)
-        keep("cells", self._scratch[: 2 * size].reshape((size, 2)))
-        keep("_best", self._scratch[2 * size : 2 * size + 1])
-        keep("_sums", self._scratch[2 * size + 1 :])
-        buffer("_candidate", int(_CANDIDATES), wp.vec3)
+        # One array of what each launch clears: per cell and part two words, the best hypothesis, the sums of the fit.
+        buffer("_scratch", 2 * size * parts + 10, wp.int64)
+        keep("_tables", self._scratch[: 2 * size * parts].reshape((size * parts, 2)))
+        keep("cells", self._tables[:size])
+        keep("_best", self._scratch[-10:-9])
+        keep("_sums", self._scratch[-9:])
+        buffer("_candidate", int(_CANDIDATES), wp.vec4)
         buffer("cell", self.capacity, wp.int32)
         buffer("plane", 1, wp.vec3)
         buffer("found_height", 1, wp.float32)
@@ -305,8 +445,13 @@ class GroundPlane:
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         given = math.nan if self.sensor_height is None else self.sensor_height
-        fit = [self._candidate, self._best, self._sums]
         self._scratch.zero_()
+        if self.parts:
+            launch_parts(_bin_part, self.parts, [xyz, count, self._tables], [self.cell])
+            launch_parts(_merge_part, self.parts, [xyz, self._tables], [self._candidate])
+            self._run(_fit_in_order, 1, [self._candidate, given, self._sums], [self.plane, self.found_height])
+            return
+        fit = [self._candidate, self._best, self._sums]
         self._run(_bin_points, n, [xyz, count, self.cells], [self.cell])
         self._run(_pick_candidates, int(_CANDIDATES), [xyz, self.cells], [self._candidate])
         self._run(_vote_planes, int(_HYPOTHESES), [self._candidate, given, self._best], [])
