@@ -2,7 +2,8 @@
 
 KISS-ICP (Vizzo et al., 2023) on the kernels of this package: a constant-velocity prediction, points brought to one
 moment by it, registration against a map of voxels with a robust kernel, and a threshold that follows how wrong the
-predictions are. Poses are of the scan's version, its first moment.
+predictions are. That moment is the middle of the scan's points: there a wrong prediction bends a scan but does not
+move it, so that it does not make the next one wrong in turn. Poses are of the scan's version, its first moment.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from ..kernels.device import resolve_device
 from ..kernels.downsample import VoxelDownsample
 from ..kernels.filters import PointFilter
-from ..kernels.interop import Points, borrow_points, count_on
+from ..kernels.interop import Points, borrow, borrow_points, count_on
 from ..kernels.motion import compensate_motion
 from ..kernels.registration import ScanRegistration
 from ..kernels.voxel_map import VoxelMap
@@ -29,6 +30,7 @@ __all__ = ["Odometry", "OdometryConfig"]
 # Points are brought to their scan's moment along a path through these moments after it [s]: close enough together for
 # the path between to be plain, and no sweep takes longer.
 _MOMENTS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+_TIMES = 1024  # of a scan's points, as many of which are enough to tell their middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,8 +134,10 @@ class Odometry:
         self.voxel_map.clear()
         self._threshold = AdaptiveThreshold(self.config)
         self._version: int | None = None
-        self._pose = np.eye(4)
+        self._middle = 0.0  # of the last scan, after its version [s]
+        self._pose = np.eye(4)  # at the last scan's middle
         self._velocity = np.zeros(6)  # translation and rotation vector, a second
+        self._first: tuple[int, wp.array, wp.array] | None = None  # the first scan, until the motion in it is known
         self.lost = 0
         """Scans that could not be registered."""
 
@@ -153,14 +157,30 @@ class Odometry:
             TypeError: `points` is not a floating array.
             ValueError: Time does not go forward, or a shape does not fit.
         """
-        version = int(version)
-        seconds = self._seconds_since_last(version)
+        is_first = self._version is None
+        pose = self._take(int(version), points, t)
+        if self._first is not None:
+            # The motion within the first scan is known only now.
+            first, velocity, lost = self._first, self._velocity, self.lost
+            self.clear()
+            self._velocity = velocity
+            self._take(*first)
+            pose = self._take(int(version), points, t)
+            self.lost = max(lost, self.lost)
+        elif is_first and t is not None:
+            self._first = (int(version), *_copied(points, t))
+        return pose
+
+    def _take(self, version: int, points: Any, t: Any) -> np.ndarray:
+        """Takes up one scan; returns the pose at its version."""
+        middle = 0.0 if t is None else _middle_of(t)
+        seconds = self._seconds_since_last(version, middle)
 
         # Predict by constant velocity
         guess = self._pose @ _motion(seconds * self._velocity)
 
-        # Bring all points to the scan's own moment
-        scan = self._compensate(points, t)
+        # Bring all points to one moment, their middle
+        scan = self._compensate(points, t, middle)
 
         # Thin the scan out, for the map and further for registration
         dense, sparse = self._downsample(scan)
@@ -176,24 +196,30 @@ class Odometry:
         self.voxel_map.launch(*dense, self._on_device(pose))
         if self._version is not None:
             self._velocity = _vector(invert(self._pose) @ pose) / seconds
-        self._pose, self._version = pose, version
-        return pose.copy()
+        self._pose, self._version, self._middle = pose, version, middle
+        return pose @ _motion(-middle * self._velocity)
 
-    def _seconds_since_last(self, version: int) -> float:
+    def _seconds_since_last(self, version: int, middle: float) -> float:
         if self._version is None:
-            return 0.0
+            return middle
         if version <= self._version:
             raise ValueError(
                 f"version is {version} ns, not after the last scan's {self._version} ns: odometry takes scans in the "
                 "order of time; call clear() before a new recording"
             )
-        return (version - self._version) * 1e-9
+        seconds = (version - self._version) * 1e-9 + (middle - self._middle)
+        if seconds <= 0.0:
+            raise ValueError(
+                f"t is {middle:.3g} s in the mean, which is not after the last scan's points with {self._middle:.3g} s "
+                "and its version: t is the time of each point after its own scan's version"
+            )
+        return seconds
 
-    def _compensate(self, points: Any, t: Any) -> Points:
-        """The points on the device, as they would be seen from where the sensor was at the scan's moment."""
+    def _compensate(self, points: Any, t: Any, middle: float) -> Points:
+        """The points on the device, as they would be seen from where the sensor was at the scan's middle."""
         if t is not None and self._velocity.any():
             poses = np.stack([_motion(moment * self._velocity) for moment in _MOMENTS])
-            points = compensate_motion(points, t, poses, _MOMENTS, 0.0)
+            points = compensate_motion(points, t, poses, _MOMENTS, middle)
         scan = borrow_points(points)
         if len(scan) > self.config.capacity:
             raise ValueError(
@@ -222,6 +248,26 @@ class Odometry:
 
     def _on_device(self, pose: np.ndarray) -> wp.array:
         return wp.array(pose[None], dtype=wp.mat44d, device=self._device)
+
+
+def _stamps(t: Any) -> tuple[wp.array, Any]:
+    """The times of a scan's points, and the owner of their memory."""
+    wide = str(t.dtype).endswith(("float64", "float64'>"))
+    return borrow(t, wp.float64 if wide else wp.float32, (None,), "t")
+
+
+def _copied(points: Any, t: Any) -> tuple[wp.array, wp.array]:
+    scan = borrow_points(points)
+    stamps, _owner = _stamps(t)
+    return wp.clone(scan.table), wp.clone(stamps)
+
+
+def _middle_of(t: Any) -> float:
+    """The mean time of a scan's points [s], by some of them."""
+    stamps, _owner = _stamps(t)
+    some = stamps[:: max(stamps.shape[0] // _TIMES, 1)].numpy().astype(np.float64)
+    some = some[np.isfinite(some)]
+    return float(np.clip(some.mean(), _MOMENTS[0], _MOMENTS[-1])) if len(some) else 0.0
 
 
 def _motion(vector: np.ndarray) -> np.ndarray:

@@ -88,7 +88,7 @@ def test_times_of_points_undo_the_motion_within_a_scan():
     drive, still = (Drive(speed=10.0, turn=0.6, frames=10, distorted=which) for which in (True, False))
     odometry = Odometry()
     for version, seen, t in drive.scans():
-        scan = odometry._compensate(seen, t)
+        scan = odometry._compensate(seen, t, 0.0)
         odometry.update(version, seen, t)
     compensated = scan.table.numpy()
     *_, (_, expected, _) = still.scans()
@@ -97,6 +97,29 @@ def test_times_of_points_undo_the_motion_within_a_scan():
     assert before > 0.5
     assert after < 0.2 * before
     assert np.array_equal(compensated[:, 3], seen[:, 3])
+
+
+def test_errors_of_the_velocity_die_away():
+    """A circle at 6 m/s, seen point by point: jolts of the velocity must not feed themselves from scan to scan."""
+    drive = Drive(speed=6.0, turn=0.6, frames=45)
+    poses, odometry = followed(drive)
+    truth = drive.poses()
+    assert odometry.lost == 0
+    assert absolute_trajectory_error(poses, truth, align=False).max < 0.15
+    late = relative_pose_error(poses[15:], truth[15:])
+    assert late.translation_rmse < 0.05
+    assert late.rotation_rmse < np.radians(0.3)
+
+
+@pytest.mark.parametrize("offset", [-0.1, -0.05, 0.05])
+def test_poses_are_of_the_version_wherever_the_times_lie(offset):
+    """Times of points before, around or after the version: the motion within a scan is undone all the same."""
+    drive = Drive(frames=12)
+    odometry = Odometry()
+    shift = round(offset * 1e9)
+    poses = np.array([odometry.update(v - shift, p, t + np.float32(offset)) for v, p, t in drive.scans()])
+    truth = np.array([drive.pose(k * drive.period - offset) for k in range(drive.frames)])
+    assert absolute_trajectory_error(poses, invert(truth[0]) @ truth, align=False).max < 0.15
 
 
 def test_the_same_scans_give_the_same_bytes_and_clear_begins_anew():
@@ -184,6 +207,10 @@ def test_refuses_what_makes_no_sense():
         odometry.update(5, np.zeros((10, 3), np.float32))
     with pytest.raises(ValueError, match="points has 101 rows, more than the capacity of 100"):
         odometry.update(6, np.zeros((101, 3), np.float32))
+    with pytest.raises(ValueError, match="which is not after the last scan's points"):
+        odometry.update(6, np.zeros((10, 3), np.float32), np.full(10, -0.9))
+    with pytest.raises(ValueError, match="t must have shape"):
+        odometry.update(6, np.zeros((10, 3), np.float32), np.zeros((10, 1)))
     with pytest.raises(TypeError, match="must be of a floating type"):
         odometry.update(7, np.zeros((10, 3), int))
     with pytest.raises(ValueError, match="must have shape"):
