@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from warploom.kernels import outliers
 from warploom.kernels.outliers import RadiusOutliers, StatisticalOutliers, radius_outliers, statistical_outliers
+from warploom.kernels.threads import set_thread_count, thread_count
 
 # A point whose mean distance is this near to the threshold, as a share of it, may fall on either side.
 TOLERANCE = 1e-6
@@ -194,6 +196,45 @@ def test_the_plans_read_their_count(device):
         assert np.array_equal(far.outlier.numpy()[:n][~close], expected[~close])
         assert near.outlier.numpy()[n:].all()
         assert far.outlier.numpy()[n:].all()
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_parts_do_not_change_a_byte(parts):
+    points, before = cloud(6000, 9), thread_count()
+    expected = (radius_outliers(points, 0.5, 4).tobytes(), statistical_outliers(points, 10, 1.0).tobytes())
+    xyz, count = wp.array(points, dtype=wp.vec3, device="cpu"), wp.array([6000], dtype=wp.int32, device="cpu")
+    try:
+        set_thread_count(parts)
+        near = RadiusOutliers(radius=0.5, min_neighbors=4, capacity=6000, device="cpu")
+        far = StatisticalOutliers(neighbors=10, std_ratio=1.0, capacity=6000, device="cpu")
+    finally:
+        set_thread_count(before)
+    near.launch(xyz, count)
+    far.launch(xyz, count)
+    assert (near.outlier.numpy().tobytes(), far.outlier.numpy().tobytes()) == expected
+
+
+def test_one_thread_a_point_says_the_same():
+    """As on a GPU."""
+    points = cloud(3000, 10)
+    plan = RadiusOutliers(radius=0.5, min_neighbors=4, capacity=3000, device="cpu")
+    plan.launch(wp.array(points, dtype=wp.vec3, device="cpu"), wp.array([3000], dtype=wp.int32, device="cpu"))
+    tree, outlier = plan._tree, wp.full(3000, True, dtype=wp.bool, device="cpu")
+    inputs = [tree.points, tree.index, tree.size, tree.low, tree.high, tree.leaves, plan._reach, plan.min_neighbors]
+    wp.launch(outliers._find_lonely, 3000, inputs=inputs, outputs=[outlier], device="cpu")
+    assert np.array_equal(outlier.numpy(), plan.outlier.numpy())
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float64])
+def test_other_floats_strides_and_read_only_arrays(dtype):
+    points = cloud(500, 11)
+    points = points[np.isfinite(points).all(axis=1)].clip(-60000, 60000)
+    other = np.zeros((2 * len(points), 5), dtype)
+    other[::2, 1:4] = points
+    other.setflags(write=False)
+    given_so, plain = other[::2, 1:4], np.ascontiguousarray(other[::2, 1:4], np.float32)
+    assert np.array_equal(radius_outliers(given_so, 0.5, 4), radius_outliers(plain, 0.5, 4))
+    assert np.array_equal(statistical_outliers(given_so, 10), statistical_outliers(plain, 10))
 
 
 def test_the_same_cloud_gives_the_same_bytes(device):
