@@ -4,11 +4,12 @@ from ..datamesh import Status
 from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
 from .configuration import ConfigFile, find_config, import_class, nearest, parse_overrides
+from .drawing import draw_mermaid, draw_text
 from .engine import GraphEngine, Run, Vertex, VertexTiming
-from .graph import draw_mermaid, draw_text
 from .process import Process, load_module
 from .processor import In, Out, Processor, ProcessorConfig, ProcessorHarness
 from .schema import ComponentSpec, ModuleSpec, VertexSpec
+from .svg import draw_svg
 from .sync import CommitDagProcessor
 from .trigger import Trigger
 
@@ -37,6 +38,7 @@ __all__ = [
     "VertexSpec",
     "VertexTiming",
     "draw_mermaid",
+    "draw_svg",
     "draw_text",
     "find_config",
     "import_class",

@@ -1,8 +1,7 @@
-"""The graph of a component: built from its configuration, checked before anything runs, and drawn."""
+"""The graph of a component: built from its configuration and checked before anything runs."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +16,6 @@ __all__ = [
     "DeclaredVertex",
     "check_payloads",
     "declare_vertices",
-    "draw_mermaid",
-    "draw_text",
     "graph_payloads",
     "type_name",
     "vertex_order",
@@ -203,67 +200,3 @@ def check_payloads(given: Any, wanted: Any) -> bool:
 def type_name(payload: Any) -> str:
     """How messages call a payload's type."""
     return payload.__name__ if isinstance(payload, type) else str(payload)
-
-
-def draw_text(module: ModuleSpec) -> str:
-    """The module's components and vertices as indented text: inputs → name → outputs."""
-    lines = [f"module {module.module}"]
-    for component in module.components:
-        inputs = ", ".join(component.inputs.values()) or "-"
-        outputs = ", ".join(component.outputs.values()) or "-"
-        lines.append(f"  {component.name} ({component.kind}): {inputs} -> {outputs}")
-        for name, inputs_of, outputs_of in _edges(component):
-            lines.append(f"    {', '.join(inputs_of) or '-'} -> [{name}] -> {', '.join(outputs_of) or '-'}")
-    return "\n".join(lines)
-
-
-def _edges(component: ComponentSpec) -> list[tuple[str, list[str], list[str]]]:
-    """Per vertex: its name, the data it reads, the data it gives."""
-    edges = []
-    for name, spec in component.graph.items():
-        ports = import_class(spec.processor)().ports
-        inputs = [spec.inputs.get(p, p) for p, port in ports.items() if isinstance(port, In)]
-        outputs = [spec.outputs.get(p, p) for p, port in ports.items() if isinstance(port, Out)]
-        edges.append((name, inputs, outputs))
-    return edges
-
-
-def draw_mermaid(module: ModuleSpec) -> str:
-    """The module as a Mermaid flow chart: a box per component, in it the vertices, arrows named by their data."""
-    lines = ["flowchart LR"]
-    topics: dict[str, None] = {}
-    links: list[str] = []
-    for component in module.components:
-        box = _node("c", component.name)
-        topics.update(dict.fromkeys((*component.inputs.values(), *component.outputs.values())))
-        if not component.graph:
-            lines.append(f'  {box}["{component.name}"]')
-            links += [f"  {_topic(topic)} --> {box}" for topic in component.inputs.values()]
-            links += [f"  {box} --> {_topic(topic)}" for topic in component.outputs.values()]
-            continue
-        lines.append(f'  subgraph {box}["{component.name} ({component.kind})"]')
-        edges = _edges(component)
-        producers = {datum: name for name, _, given in edges for datum in given}
-        for name, _, _ in edges:
-            lines.append(f'    {_node(box, name)}["{name}"]')
-        lines.append("  end")
-        for name, read, _ in edges:
-            for datum in read:
-                if datum in producers:
-                    links.append(f"  {_node(box, producers[datum])} -- {datum} --> {_node(box, name)}")
-                elif datum in component.inputs:
-                    links.append(f"  {_topic(component.inputs[datum])} --> {_node(box, name)}")
-            output = component.graph[name].config.get("output")
-            if output in component.outputs:
-                links.append(f"  {_node(box, name)} --> {_topic(component.outputs[output])}")
-    lines += [f'  {_topic(topic)}(["{topic}"])' for topic in topics]
-    return "\n".join(lines + links)
-
-
-def _topic(topic: str) -> str:
-    return _node("t", topic)
-
-
-def _node(prefix: str, name: str) -> str:
-    """A name as Mermaid takes it: letters, digits and underscores."""
-    return prefix + "_" + re.sub(r"\W", "_", name)

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterable
 
 from .handle import Output
 from .mesh import DataMesh
+from .policy import CommitPolicy, EqualVersion
 from .recording import EventKind, RecordedEvent
 from .recording_reader import Recording
-from .window import CommitPolicy
 
 __all__ = ["Player"]
 
@@ -22,9 +22,9 @@ _log = logging.getLogger(__name__)
 class Player:
     """Publishes the commits and settled versions of a recording, in their order.
 
-    Time is that of the versions: with `rate=2` ten seconds between two versions take five. Where the recording entered
-    a new epoch, and each time it starts over, the whole mesh enters one, after `before_epoch` has been called: whoever
-    owns the mesh waits there until nothing of the old epoch is on its way any more.
+    Time is that of the versions: with `rate=2` ten seconds between two versions take five. Where the recording enters a
+    new epoch, and each time it starts over, so do the topics, after `before_epoch` has been called: whoever owns the
+    mesh waits there until nothing of the old epoch is on its way any more, as what comes later would be discarded.
     """
 
     def __init__(
@@ -68,6 +68,7 @@ class Player:
         self._before_epoch = before_epoch
         self._on_event = on_event
         self._stopping = threading.Event()
+        self._epoch = 0
         self._outputs: dict[str, Output] = {}
         for topic in topics:
             self._outputs[topic] = Output()
@@ -89,48 +90,44 @@ class Player:
         """
         done = 0
         while (self._loops is None or done < self._loops) and not self._stopping.is_set():
-            if done:
-                self._new_epoch()
             published = self.published.total()
-            self._once()
+            self._once(self._epoch + 1 if done else 0)
             done += 1
-            if self.published.total() == published:  # an empty recording would loop for ever
+            if self.published.total() == published:  # a recording without events would loop for ever
                 return
 
-    def _once(self) -> None:
-        first = epoch = beginning = origin = None
-        newest: dict[str, int] = {}
+    def _once(self, offset: int) -> None:
+        """Plays it once; its first epoch becomes the epoch `offset` of the mesh."""
+        base: int | None = None
+        beginning = origin = 0
         start = 0.0
+        newest: dict[str, tuple[int, int]] = {}
         for event in self._recording:
             if event.topic not in self._outputs or event.kind is EventKind.LOSS:
                 continue
-            if first is None or beginning is None:
-                first, beginning = event.epoch, event.version
-            if event.epoch == first and event.version < beginning + self._seek_ns:
+            if base is None:
+                base, beginning = event.epoch, event.version
+            if event.epoch == base and event.version < beginning + self._seek_ns:
                 continue
-            if epoch is None or event.epoch > epoch:
-                if epoch is not None:
-                    self._new_epoch()
-                epoch, origin, start = event.epoch, event.version, time.perf_counter()
-                newest.clear()
-            if self._rate is not None and origin is not None:
+            epoch = offset + max(0, event.epoch - base)
+            if not newest or epoch > self._epoch:
+                if epoch > self._epoch:
+                    self._before_epoch()
+                self._epoch, origin, start = epoch, event.version, time.perf_counter()
+            if self._rate is not None:
                 due = start + (event.version - origin) / 1e9 / self._rate
                 self._stopping.wait(max(0.0, due - time.perf_counter()))
             if self._stopping.is_set() or not self._on_event(event):
                 self._stopping.set()
                 return
-            self._publish(event, event.version < newest.get(event.topic, -1))
-            newest[event.topic] = max(event.version, newest.get(event.topic, -1))
+            order = (epoch, event.version)
+            self._publish(event, epoch, order < newest.get(event.topic, order))
+            newest[event.topic] = max(order, newest.get(event.topic, order))
 
-    def _new_epoch(self) -> None:
-        self._before_epoch()
-        for topic in self._mesh.topics():
-            self._mesh.window(topic).new_epoch()
-
-    def _publish(self, event: RecordedEvent, late: bool) -> None:
+    def _publish(self, event: RecordedEvent, epoch: int, late: bool) -> None:
         output = self._outputs[event.topic]
         if event.kind is EventKind.SETTLE:
-            output.settle(event.version)
+            output.settle(event.version, epoch)
             return
         try:
             value = event.value
@@ -139,8 +136,9 @@ class Player:
                 _log.warning("%s: %s at %d is skipped: %s", self._recording.path, event.topic, event.version, error)
             self.skipped[event.topic] += 1
             return
+        policy = CommitPolicy.INSERT_SORTED if late else CommitPolicy.DISCARD_OUT_OF_ORDER
         with output.allocate_change() as change:
-            change.set_version(event.version)
+            change.set_version(event.version, epoch=epoch)
             change.value = value
-            output.commit(CommitPolicy.INSERT_SORTED if late else CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+            output.commit(policy, change, equal=EqualVersion.REPLACE)
         self.published[event.topic] += 1

@@ -25,10 +25,11 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import SinkError
+from .clock import Clock, SystemClock
 from .counters import LossCounters
 from .mesh import DataMesh
 from .messages import decode, encode, message_type
-from .window import Entry, Window
+from .snapshot import Entry
 
 __all__ = ["ENCODING", "HEADER", "LOSSES", "EventKind", "RecordedEvent", "Recorder", "digest"]
 
@@ -176,7 +177,8 @@ class Recorder:
         self._queue: queue.Queue[_Event | None] = queue.Queue(_QUEUE)
         self._channels: dict[str, int] = {}
         self._closing = threading.Event()
-        self._clock = time.time_ns() - time.perf_counter_ns()
+        self._clock: Clock = SystemClock()
+        self._wall_ns = 0
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = _File(self.path)
@@ -198,35 +200,23 @@ class Recorder:
 
     def watch(self, mesh: DataMesh, topics: Iterable[str]) -> None:
         """Records some topics of a mesh from now on, and what the mesh loses."""
-        self._losses = mesh.losses
+        self._losses, self._clock = mesh.losses, mesh.clock
+        self._wall_ns = time.time_ns() - mesh.clock.monotonic_ns()
         mesh.losses.on_loss(self._on_loss)
         for topic in topics:
-            window = mesh.window(topic)
-            window.subscribe(partial(self._on_commit, window), partial(self._on_settle, window))
+            mesh.window(topic).subscribe(partial(self._on_commit, topic), partial(self._on_settle, topic))
 
-    def _on_commit(self, window: Window, entry: Entry) -> None:
-        epoch = window.snapshot().epoch
-        self._offer(
-            _Event(
-                window.topic,
-                EventKind.COMMIT,
-                epoch,
-                entry.version,
-                entry.received_ns,
-                entry.committed_ns,
-                entry.value,
-            )
-        )
+    def _on_commit(self, topic: str, entry: Entry) -> None:
+        stamps = entry.received_ns, entry.committed_ns
+        self._offer(_Event(topic, EventKind.COMMIT, entry.epoch, entry.version, *stamps, entry.value))
 
-    def _on_settle(self, window: Window, version: int) -> None:
-        now = time.perf_counter_ns()
-        self._offer(_Event(window.topic, EventKind.SETTLE, window.snapshot().epoch, version, 0, now, None))
+    def _on_settle(self, topic: str, version: int, epoch: int) -> None:
+        self._offer(_Event(topic, EventKind.SETTLE, epoch, version, 0, self._clock.monotonic_ns(), None))
 
     def _on_loss(self, place: str, reason: str, version: int) -> None:
         # What the recorder itself loses is in its own counters: recording it would lose it again.
         if not place.startswith("recorder "):
-            now = time.perf_counter_ns()
-            self._offer(_Event(LOSSES, EventKind.LOSS, 0, version, 0, now, (place, reason)))
+            self._offer(_Event(LOSSES, EventKind.LOSS, 0, version, 0, self._clock.monotonic_ns(), (place, reason)))
 
     def _offer(self, event: _Event) -> None:
         if self._closing.is_set():
@@ -269,7 +259,7 @@ class Recorder:
         header = HEADER.pack(event.kind, event.epoch, event.received_ns, event.committed_ns, digest(payload))
         channel = self._channel(event)
         data = header if event.topic in self._digest_only else header + payload
-        self._writer.add_message(channel, event.committed_ns + self._clock, data, event.version, self.written)
+        self._writer.add_message(channel, event.committed_ns + self._wall_ns, data, event.version, self.written)
         if event.kind is EventKind.COMMIT:
             self.written += 1
 

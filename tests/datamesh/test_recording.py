@@ -99,7 +99,7 @@ def test_commits_of_many_threads_are_read_in_the_order_of_their_topics(tmp_path)
 def test_a_cause_is_read_before_its_effect_however_they_were_told(tmp_path):
     mesh = DataMesh()
     # This subscriber is there before the recorder, so the recorder is told of its commits first.
-    mesh.window("cause").subscribe(lambda entry: commit(mesh, "effect", entry.version, "e"), lambda version: None)
+    mesh.window("cause").subscribe(lambda entry: commit(mesh, "effect", entry.version, "e"), lambda *_: None)
     with Recorder(tmp_path / "a.mcap") as recorder:
         recorder.watch(mesh, ["cause", "effect"])
         for version in range(50):
@@ -156,7 +156,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, when_full, c
     recorder._file._file = FullDisk(recorder._file._file, 9_000_000)
     recorder.watch(mesh, ["cloud"])
     seen = []
-    mesh.window("cloud").subscribe(lambda entry: seen.append(entry.version), lambda version: None)
+    mesh.window("cloud").subscribe(lambda entry: seen.append(entry.version), lambda *_: None)
     for version in range(300):
         commit(mesh, "cloud", version, np.full(50_000, version, np.float32))
         if when_full == "drop":
