@@ -2,18 +2,23 @@
 
 A pillar is described by what transfers between sensors: which height slices hold points, where in the cell they
 lie and how high they reach. Intensity, the number of points and the position in the grid are left out on purpose.
-All sums are integers, so the bytes do not depend on the order of the points or of the threads.
+All sums are integers, so the bytes do not depend on the order of the points or of the threads: on a CPU each thread
+sums and draws rows of its own, on a GPU all share all cells.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from .device import resolve_device
-from .interop import borrow_points, give
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import adopt, borrow_points, count_on, give
+from .parts import parts_for, run_parts
+from .pillar_rows import PillarSpec, describe_points, draw_rows
 from .plan import capacity_for, plan_for
 
 __all__ = ["PILLAR_SLICES", "SLICE_HEIGHT", "PillarGrid", "pillar_channels", "pillarize"]
@@ -24,10 +29,15 @@ PILLAR_SLICES = 15
 SLICE_HEIGHT = 0.25
 """Height of a slice [m]."""
 
-# A cell's sums are one row of 32 bytes: points, sums of z above the range [mm] and of dx, dy from the cell's corner
-# [1/4096 cell], slice bits, highest and lowest of these z, and the slice bits that the grid shows now.
+# Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
+
+_LEAST_PART = 30_000  # points; fewer are drawn sooner than a second thread is woken
+# A cell's sums are one row, one cache line, of 64-bit numbers: points, sums of z above the range [mm] and of dx, dy
+# from the cell's corner [1/4096 cell], slice bits, highest and lowest of these z, and the slice bits that the grid
+# shows now.
 _POINTS, _Z, _DX, _DY, _BITS, _HIGH, _LOW, _SHOWN, _ROW = (wp.constant(i) for i in (0, 1, 2, 3, 4, 5, 6, 7, 8))
-_CEILING = wp.constant(2**31 - 1)
+_CEILING = wp.constant(wp.int64(2**31 - 1))
 _SLICES = wp.constant(PILLAR_SLICES)
 _LAST_SLICE = wp.constant(PILLAR_SLICES - 1)
 
@@ -42,7 +52,7 @@ def pillar_channels() -> tuple[str, ...]:
 def _clear_pillars(
     # in
     shown_in: wp.array(dtype=wp.uint32),
-    sums_in: wp.array2d(dtype=wp.int32),
+    sums_in: wp.array2d(dtype=wp.int64),
     # in out
     grid: wp.array3d(dtype=wp.float32),
 ):
@@ -58,7 +68,7 @@ def _clear_pillars(
             column = cell - row * grid.shape[2]
             bits = sums_in[cell, _SHOWN]
             for s in range(_SLICES):
-                if (bits >> s) & 1 != 0:
+                if (int(bits) >> s) & 1 != 0:
                     grid[s, row, column] = 0.0
             for channel in range(_SLICES, _SLICES + 5):
                 grid[channel, row, column] = 0.0
@@ -76,7 +86,7 @@ def _sum_pillars(
     inverse_slice: float,
     columns: int,
     # in out
-    sums: wp.array2d(dtype=wp.int32),
+    sums: wp.array2d(dtype=wp.int64),
     occupied: wp.array(dtype=wp.uint32),
 ):
     """Adds each point to its cell; the first in a cell marks the cell as occupied."""
@@ -96,16 +106,16 @@ def _sum_pillars(
     column = wp.min(int(u), columns - 1)
     row = wp.min(int(v), sums.shape[0] // columns - 1)
     cell = row * columns + column
-    above = int((z - low[2]) * 1000.0)
+    above = wp.int64(int((z - low[2]) * 1000.0))
     level = wp.where(z >= 0.0, wp.min(int(z * inverse_slice) + 1, _LAST_SLICE), 0)
-    if wp.atomic_add(sums, cell, _POINTS, 1) == 0:
+    if wp.atomic_add(sums, cell, _POINTS, wp.int64(1)) == wp.int64(0):
         wp.atomic_or(occupied, cell >> 5, wp.uint32(1) << wp.uint32(cell & 31))
     wp.atomic_add(sums, cell, _Z, above)
-    wp.atomic_add(sums, cell, _DX, int((u - float(column)) * 4096.0))
-    wp.atomic_add(sums, cell, _DY, int((v - float(row)) * 4096.0))
+    wp.atomic_add(sums, cell, _DX, wp.int64(int((u - float(column)) * 4096.0)))
+    wp.atomic_add(sums, cell, _DY, wp.int64(int((v - float(row)) * 4096.0)))
     # These only ever grow, or fall: most points change nothing, and a plain read shows it.
-    bit = 1 << level
-    if sums[cell, _BITS] & bit == 0:
+    bit = wp.int64(1 << level)
+    if sums[cell, _BITS] & bit == wp.int64(0):
         wp.atomic_or(sums, cell, _BITS, bit)
     if sums[cell, _HIGH] < above:
         wp.atomic_max(sums, cell, _HIGH, above)
@@ -119,7 +129,7 @@ def _write_pillars(
     lowest: float,
     # in out
     occupied: wp.array(dtype=wp.uint32),
-    sums: wp.array2d(dtype=wp.int32),
+    sums: wp.array2d(dtype=wp.int64),
     grid: wp.array3d(dtype=wp.float32),
     # out
     shown_out: wp.array(dtype=wp.uint32),
@@ -141,7 +151,7 @@ def _write_pillars(
             column = cell - row * grid.shape[2]
             bits = sums[cell, _BITS]
             for s in range(_SLICES):
-                if (bits >> s) & 1 != 0:
+                if (int(bits) >> s) & 1 != 0:
                     grid[s, row, column] = 1.0
             share = 1.0 / float(sums[cell, _POINTS])
             grid[_SLICES, row, column] = float(sums[cell, _DX]) * share / 4096.0 - 0.5
@@ -150,7 +160,7 @@ def _write_pillars(
             grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
             grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
             for field in range(_HIGH + 1):
-                sums[cell, field] = 0
+                sums[cell, field] = wp.int64(0)
             sums[cell, _LOW] = _CEILING
             sums[cell, _SHOWN] = bits
 
@@ -170,37 +180,68 @@ class PillarGrid:
     """Edge of a cell [m]."""
     capacity: int
     """Points that one launch can take."""
-    device: str = "cpu"
+    device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`rows` (by parts of the grid), `shared` (parallel), or `auto`: `rows` on a CPU, else `shared`: equal results."""
+    parts: int | None = None
+    """How many parts of the grid are drawn at once, by the method `rows`; by default as the threads are worth it."""
 
     def __post_init__(self):
-        low, high = self.point_range[:3], self.point_range[3:]
-        if not self.cell > 0:
-            raise ValueError(f"cell must be > 0 m, not {self.cell}")
-        if len(self.point_range) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
+        if len(self.point_range) != 6:
             raise ValueError(f"point_range must be xmin ymin zmin xmax ymax zmax, not {self.point_range}")
+        low, high = self.point_range[:3], self.point_range[3:]
+        if not (self.cell > 0 and math.isfinite(self.cell)):
+            raise ValueError(f"cell must be > 0 m and finite, not {self.cell}")
+        if not all(a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)):
+            raise ValueError(
+                f"point_range must be xmin ymin zmin xmax ymax zmax, finite, with min < max, not {self.point_range}"
+            )
         if self.capacity < 1:
             raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
-        if max(4096.0, (high[2] - low[2]) * 1000.0) * self.capacity >= 2**31:
+        if (high[2] - low[2]) * 1000.0 >= 2**31:
+            raise ValueError(f"point_range must be less than 2³¹ mm high, not {low[2]} … {high[2]} m")
+        if self.method not in ("auto", "rows", "shared"):
+            raise ValueError(f"method must be 'auto', 'rows' or 'shared', not {self.method!r}")
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts must be at least 1, not {self.parts}")
+        columns, rows = (round((high[axis] - low[axis]) / self.cell) for axis in (0, 1))
+        words = (columns + 31) // 32
+        if min(columns, rows) < 1 or rows * words * 32 >= 2**31:
             raise ValueError(
-                f"capacity {self.capacity} with heights {low[2]} … {high[2]} m overflows a sum of millimetres; "
-                "narrow the z of point_range"
+                f"point_range must be 1 to 2³¹ cells of {self.cell} m, not {rows} rows of {columns}; change cell"
             )
         device = resolve_device(self.device)
-        columns, rows = (round((high[axis] - low[axis]) / self.cell) for axis in (0, 1))
+        by_rows = self.method == "rows" or (self.method == "auto" and device == DEFAULT_DEVICE)
+
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
+            keep(name, wp.zeros(shape, dtype=dtype, device=device))
+
+        keep("_by_rows", by_rows)
+        buffer("grid", (1, PILLAR_SLICES + 5, rows, columns), wp.float32)
+        keep("_grid", self.grid[0])
+        buffer("_height", 1, wp.float32)
+        if by_rows:
+            spec = PillarSpec()
+            spec.low, spec.high = wp.vec3(*low), wp.vec3(*high)
+            spec.inverse_cell, spec.inverse_slice = 1.0 / self.cell, 1.0 / SLICE_HEIGHT
+            spec.rows, spec.columns, spec.words, spec.slices = rows, columns, words, PILLAR_SLICES
+            keep("_spec", spec)
+            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            keep("_described", [wp.empty(self.capacity, dtype=wp.int32, device=device) for _ in range(3)])
+            buffer("_sums", rows * words * 32 * int(_ROW), wp.int64)
+            buffer("_occupied", rows * words, wp.uint32)
+            buffer("_shown", rows * words, wp.uint32)
+            buffer("_shown_slices", rows * words * 32, wp.uint32)
+            return
         cells = columns * rows
-
-        def buffer(name: str, array: wp.array) -> None:
-            object.__setattr__(self, name, array)
-
-        buffer("grid", wp.zeros((1, PILLAR_SLICES + 5, rows, columns), dtype=wp.float32, device=device))
-        buffer("_grid", self.grid[0])
-        buffer("_sums", wp.zeros((cells, int(_ROW)), dtype=wp.int32, device=device))
-        self._sums[:, int(_LOW)].fill_(_CEILING)
-        words = (cells + 31) // 32
-        buffer("_occupied", wp.zeros(words, dtype=wp.uint32, device=device))
-        buffer("_shown", wp.zeros(words, dtype=wp.uint32, device=device))
-        buffer("_height", wp.zeros(1, dtype=wp.float32, device=device))
+        buffer("_sums", (cells, int(_ROW)), wp.int64)
+        self._sums[:, int(_LOW)].fill_(2**31 - 1)
+        buffer("_occupied", (cells + 31) // 32, wp.uint32)
+        buffer("_shown", (cells + 31) // 32, wp.uint32)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -221,6 +262,9 @@ class PillarGrid:
         if not isinstance(height, wp.array):
             height = self._height
             height.fill_(float(sensor_height))
+        if self._by_rows:
+            self._draw(xyz, count, height, self.grid, [self._shown, self._shown_slices])
+            return
         words = self._occupied.shape[0]
         device = self.grid.device
         wp.launch(_clear_pillars, words, inputs=[self._shown, self._sums], outputs=[self._grid], device=device)
@@ -246,6 +290,19 @@ class PillarGrid:
             inputs=[self.point_range[2]],
             outputs=[self._occupied, self._sums, self._grid, self._shown],
             device=device,
+        )
+
+    def _draw(
+        self, xyz: wp.array, count: wp.array, height: wp.array, grid: wp.array, shown: list[wp.array | None]
+    ) -> None:
+        """Draws rows by parts: on all of `grid`, or where it differs from what is `shown`."""
+        run_parts(describe_points, self._parts, self.device, [xyz, count, height, self._spec], self._described)
+        run_parts(
+            draw_rows,
+            self._parts,
+            self.device,
+            [*self._described, count, xyz.shape[0], self._spec],
+            [self._sums, self._occupied, *shown, grid.flatten()],
         )
 
 
@@ -276,5 +333,13 @@ def pillarize(
         capacity=capacity_for(len(borrowed)),
         device=borrowed.device,
     )
-    plan.launch(borrowed.xyz, wp.array([len(borrowed)], dtype=wp.int32, device=borrowed.device), sensor_height)
-    return give(plan._grid, borrowed.family)
+    count = count_on(len(borrowed), borrowed.device)
+    if borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, count, sensor_height)
+        return give(plan._grid, borrowed.family)
+    # Straight onto an array of its own: the grid is far larger than the cloud.
+    host = np.empty(plan.shape[1:], np.float32)
+    plan._height.fill_(float(sensor_height))
+    grid = wp.array(host, dtype=wp.float32, copy=False, device=DEFAULT_DEVICE)
+    plan._draw(borrowed.xyz, count, plan._height, grid, [None, None])
+    return adopt(host, borrowed.family)
