@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .device import DEFAULT_DEVICE
 from .interop import borrow, family_of, give
 from .meshes import MeshSet
+from .threads import run_together, thread_count
 
 __all__ = ["MATERIALS", "LidarCast", "RayHits", "raycast"]
 
@@ -35,6 +37,29 @@ _REFLECTIVITY, _POROSITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in r
 _MAX_PASSES = wp.constant(6)
 _STEP = wp.constant(1.0e-3)  # [m] beyond a porous face, where the beam goes on
 _NO_HIT = wp.constant(-1)
+_NOWHERE = 1.0e9  # [m]
+# On a CPU beams are cast in parts, one a thread, that take turns by so many beams: near ones meet the same faces.
+_BLOCK = wp.constant(256)
+
+
+@wp.func
+def _place_of(thread: int, part: int, parts: int) -> int:
+    """The beam of a thread of a part."""
+    return ((thread // _BLOCK) * parts + part) * _BLOCK + thread % _BLOCK
+
+
+def _launch_in_parts(kernel: wp.Kernel, n: int, device: str, inputs: list, outputs: list) -> None:
+    """One beam a thread on a GPU, one part of them on each of a CPU's threads; none shares anything with another."""
+    parts = min(thread_count(), -(-n // int(_BLOCK))) if device == DEFAULT_DEVICE else 1
+    if parts < 2 or wp.get_device(device).is_capturing:
+        wp.launch(kernel, n, inputs=[0, 1, *inputs], outputs=outputs, device=device)
+        return
+    dim = -(-n // (int(_BLOCK) * parts)) * int(_BLOCK)
+    calls = [
+        wp.launch(kernel, dim, inputs=[part, parts, *inputs], outputs=outputs, device=device, record_cmd=True).launch
+        for part in range(parts)
+    ]
+    run_together(calls)
 
 
 @wp.func
@@ -64,6 +89,8 @@ def _turn(pose_in: wp.array(dtype=wp.transform), fraction: float) -> wp.quat:
 
 @wp.kernel
 def _cast(
+    part: int,
+    parts: int,
     # in: beams
     beams_in: wp.array(dtype=wp.vec3),
     fraction_in: wp.array(dtype=wp.float32),
@@ -85,7 +112,9 @@ def _cast(
     normal_out: wp.array(dtype=wp.vec3),
 ):
     """Finds the first face that each beam does not pass through."""
-    i = wp.tid()
+    i = _place_of(wp.tid(), part, parts)
+    if i >= beams_in.shape[0]:
+        return
     f = fraction_in[i]
     start = wp.transform_get_translation(pose_in[0])
     end = wp.transform_get_translation(pose_in[1])
@@ -148,6 +177,8 @@ def _cast(
 
 @wp.kernel
 def _sense(
+    part: int,
+    parts: int,
     # in: hits
     beams_in: wp.array(dtype=wp.vec3),
     fraction_in: wp.array(dtype=wp.float32),
@@ -168,7 +199,9 @@ def _sense(
     intensity_out: wp.array(dtype=wp.float32),
 ):
     """Makes an echo of each hit: its noisy range and its intensity, or none where it is too weak."""
-    i = wp.tid()
+    i = _place_of(wp.tid(), part, parts)
+    if i >= beams_in.shape[0]:
+        return
     kept_out[i] = 0
     d = distance_in[i]
     if d < min_range or hit_label_in[i] < 0:
@@ -333,12 +366,12 @@ class LidarCast:
                 f"not {k} and {np.shape(transforms)}"
             )
         device = self.meshes.device
-        if k == 1:  # a tree needs something to hold: the same once more, which changes nothing
-            mesh, transforms, k = np.repeat(mesh, 2), np.repeat(transforms, 2, axis=0), 2
         host = self.meshes.instances(np.asarray(mesh), np.asarray(transforms, np.float64))
         # The first instance is tried before the tree is searched, so it is not in the tree.
-        lower = wp.array(host["lower"][1:], dtype=wp.vec3, device=device)
-        upper = wp.array(host["upper"][1:], dtype=wp.vec3, device=device)
+        bounds = [host["lower"][1:], host["upper"][1:]]
+        if k == 1:  # a tree needs something to hold: a point that no beam comes near
+            bounds = [np.full((1, 3), _NOWHERE, np.float32)] * 2
+        lower, upper = (wp.array(corners, dtype=wp.vec3, device=device) for corners in bounds)
         self._scene[:] = [wp.Bvh(lower, upper), lower, upper]
         self._scene_id.assign(np.array([self._scene[0].id], np.uint64))
         wp.copy(self._mesh, wp.array(host["mesh"], dtype=wp.uint64, device=device), count=k)
@@ -366,25 +399,25 @@ class LidarCast:
     def launch(self) -> None:
         """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`."""
         device, n = self.meshes.device, self._beams.shape[0]
-        wp.launch(
+        _launch_in_parts(
             _cast,
-            dim=n,
-            inputs=[
+            n,
+            device,
+            [
                 self._beams, self._fraction, self._pose, self.max_range, self._seed, self._scene_id, self._mesh,
                 self._first_face, self._rows, self.meshes.labels, self._material,
             ],
-            outputs=[self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],
-            device=device,
+            [self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],
         )  # fmt: skip
-        wp.launch(
+        _launch_in_parts(
             _sense,
-            dim=n,
-            inputs=[
+            n,
+            device,
+            [
                 self._beams, self._fraction, self._pose, self.distance, self.hit_label, self.hit_normal,
                 self._material, self._seed, self.min_range, self.reach, self.range_noise, self.drop_out,
             ],
-            outputs=[self._kept, self._range, self._intensity],
-            device=device,
+            [self._kept, self._range, self._intensity],
         )  # fmt: skip
         wp.utils.array_scan(self._kept, self._rank, inclusive=False)
         wp.launch(
@@ -403,6 +436,8 @@ class LidarCast:
 
 @wp.kernel
 def _first_hit(
+    part: int,
+    parts: int,
     # in
     mesh: wp.uint64,
     origins_in: wp.array(dtype=wp.vec3),
@@ -413,7 +448,9 @@ def _first_hit(
     face_out: wp.array(dtype=wp.int32),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    i = wp.tid()
+    i = _place_of(wp.tid(), part, parts)
+    if i >= origins_in.shape[0]:
+        return
     direction = wp.normalize(directions_in[i])
     hit = wp.mesh_query_ray(mesh, origins_in[i], direction, max_distance)
     if hit.result:
@@ -470,13 +507,9 @@ def raycast(vertices: Any, faces: Any, origins: Any, directions: Any, *, max_dis
     normal = wp.empty(n, dtype=wp.vec3, device=device)
     mesh = wp.Mesh(points=points.view(wp.vec3).flatten(), indices=corners.flatten())
     if n:
-        wp.launch(
-            _first_hit,
-            dim=n,
-            inputs=[mesh.id, starts.view(wp.vec3).flatten(), along.view(wp.vec3).flatten(), float(max_distance)],
-            outputs=[distance, face, normal],
-            device=device,
-        )
+        along = along.view(wp.vec3).flatten()
+        given = [mesh.id, starts.view(wp.vec3).flatten(), along, float(max_distance)]
+        _launch_in_parts(_first_hit, n, str(device), given, [distance, face, normal])
     hits = RayHits(give(distance, family), give(face, family), give(normal, family))
     del keep_points, keep_corners, keep_starts, keep_along
     return hits

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from warploom.kernels.meshes import MeshSet
 from warploom.kernels.raycast import MATERIALS, LidarCast, raycast
+from warploom.kernels.threads import set_thread_count, thread_count
 
 # float32 coordinates of up to about 60 m: a few units in the last place of a distance.
 DISTANCE_TOLERANCE = 2e-4
@@ -311,3 +312,20 @@ def test_the_sweep_can_be_captured(device):
         cast.launch()
     wp.capture_launch(capture.graph)
     assert np.array_equal(once, cast.points.numpy())
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_results_do_not_depend_on_the_number_of_threads(threads):
+    """To the byte, for ray counts around the size of a part's turn."""
+    before = thread_count()
+    try:
+        for rays in (1, 255, 256, 257, 1500):
+            given = soup(5, faces=200, rays=rays)
+            set_thread_count(1)
+            one = raycast(*given)
+            set_thread_count(threads)
+            many = raycast(*given)
+            for name in ("distance", "face", "normal"):
+                assert getattr(one, name).tobytes() == getattr(many, name).tobytes(), name
+    finally:
+        set_thread_count(before)
