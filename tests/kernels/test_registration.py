@@ -275,6 +275,63 @@ def test_nothing_in_reach_leaves_the_guess():
     assert got.fitness == 0.0
 
 
+def odd_cloud(kind, rng, n):
+    """Clouds that say little or nothing about a motion, and clouds that no sensor would give."""
+    line = np.outer(rng.uniform(-20, 20, n), [1.0, 0.5, 0.1])
+    plane = np.c_[rng.uniform(-20, 20, (n, 2)), np.zeros(n)]
+    return {
+        "one place": np.ones((n, 3)),
+        "a line": line,
+        "a plane": plane,
+        "a hundred kilometres away": plane + 1e5,
+        "a coarse grid": np.round(rng.uniform(-9, 9, (n, 3))),
+        "denormals": rng.normal(0, 1e-42, (n, 3)),
+        "beyond all voxels": rng.normal(0, 1e30, (n, 3)),
+        "infinite": np.full((n, 3), np.inf),
+        "some not finite": np.where(rng.random((n, 1)) < 0.3, np.nan, plane),
+    }[kind].astype(np.float32)
+
+
+ODD = (
+    "one place", "a line", "a plane", "a hundred kilometres away", "a coarse grid", "denormals", "beyond all voxels",
+    "infinite", "some not finite",
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(ODD), st.sampled_from(ODD), st.sampled_from([0, 1, 2, 400]))
+def test_of_any_clouds_the_result_is_a_rigid_motion_and_the_input_stays(seed, source, target, n):
+    rng = np.random.default_rng(seed)
+    clouds = [odd_cloud(kind, rng, size) for kind, size in ((source, n), (target, 400))]
+    before = [cloud.copy() for cloud in clouds]
+    for cloud in clouds:
+        cloud.flags.writeable = False
+    guess = motion(rng.normal(0, 0.1, 3), rng.normal(0, 0.05, 3))
+    found = register(*clouds, initial=guess)
+    assert np.isfinite(found.transform).all()
+    turn = found.transform[:3, :3]
+    assert np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6
+    assert np.linalg.det(turn) > 0
+    assert np.array_equal(found.transform[3], [0, 0, 0, 1])
+    assert 0.0 <= found.fitness <= 1.0
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(clouds, before, strict=True))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_whatever_moves_the_target_moves_the_result(seed):
+    """By whole voxels, and of coordinates that float32 holds exactly, so that the map holds the very same points."""
+    rng = np.random.default_rng(seed)
+    target = (np.round(room(seed) * 64) / 64 + 1 / 128).astype(np.float32)
+    source = moved(room(seed + 1), motion(rng.normal(0, 0.1, 3), rng.normal(0, 0.02, 3)))
+    shift = motion(rng.integers(-300, 300, 3).astype(float), np.zeros(3))
+    here = register(source, target).transform
+    there = register(source, moved(target, shift), initial=shift).transform
+    translation, angle = apart(shift @ here, there)
+    assert translation < 1e-6
+    assert angle < 1e-6
+
+
 def test_what_is_not_finite_is_left_out():
     source, target = room(10), moved(room(11), motion([0.1, 0, 0], [0, 0, 0.01]))
     expected = register(source, target).transform

@@ -153,6 +153,31 @@ def test_scans_without_points_get_the_prediction_and_the_way_goes_on(nothing):
     assert absolute_trajectory_error(np.array(poses), drive.poses(), align=False).max < 0.1
 
 
+@pytest.mark.parametrize(
+    "odd",
+    [
+        np.full((500, 3), 5.0),
+        np.full((500, 3), np.inf),
+        np.random.default_rng(2).normal(0, 1e30, (500, 3)),
+        np.random.default_rng(3).normal(0, 1e5, (500, 3)),
+        np.outer(np.linspace(3, 50, 500), [1.0, 0.5, 0.1]),
+        np.zeros((1, 3)),
+    ],
+    ids=["one place", "infinite", "beyond all numbers", "far away", "a line", "one point"],
+)
+def test_scans_that_say_nothing_are_survived(odd):
+    """Three in a row, of float64 and read only; the pose stays a rigid motion and the way goes on."""
+    drive = Drive(frames=14, distorted=False)
+    odd.flags.writeable = False
+    odometry = Odometry()
+    poses = np.array(
+        [odometry.update(v, odd if k in (6, 7, 8) else points) for k, (v, points, _) in enumerate(drive.scans())]
+    )
+    assert np.isfinite(poses).all()
+    assert np.abs(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < 1e-6
+    assert absolute_trajectory_error(poses[[-1]], drive.poses()[[-1]], align=False).max < 0.2
+
+
 def test_a_first_scan_without_points_does_no_harm():
     drive = Drive(frames=6, distorted=False)
     odometry = Odometry()
