@@ -3,6 +3,7 @@
 Space is cut into cells of side radius / √3, so that a cell is one component by itself, and blocks of 4 × 4 × 2 cells,
 each of which knows by a bit which of its cells have points. Only blocks are looked up in a hash table: 13 neighbours
 each. Components are joined by atomic minimum: the lower root stays, and whom it has displaced is joined in turn.
+A radius that grows with the range has cells of several sizes, whose blocks lie far apart in the same table.
 Where the device has no 64-bit numbers, pairs whose distance is within 1e-6 of the radius may be decided otherwise.
 """
 
@@ -13,71 +14,40 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from ..cluster import _SMALLEST_RADIUS
+from ..cluster import _LEAST_GROWTH, _SMALLEST_RADIUS
 from ..interop import Points
 from ..plan import capacity_for, plan_for
+from .cell_pairs import (
+    Integers,
+    Radius,
+    Rows,
+    Table,
+    cell_of,
+    cells_reached,
+    find,
+    level_in,
+    levels_reached,
+    point_of,
+    radius_of,
+    touch,
+    unite,
+)
 from .device import DEFAULT_TAICHI, check_count, give_back, has_64_bits, launching, rows_of, start, workspace
 from .parallel import NO_POINT, bits_of, block_sums_for, scan
 
 __all__ = ["EuclideanCluster", "cluster"]
 
-_LARGEST_CELL = 2.0**30
 _LARGEST_FLOAT = 3.4028235e38
-_BRUTE_FORCE = 4096.0  # pairs of points up to which nothing beats trying them all
 _BLOCKS, _CELLS, _CLUSTERS, _LISTED = range(4)
 
-_Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
-_Table = ti.types.ndarray(dtype=ti.i32, ndim=2)
-_Rows = ti.types.ndarray(dtype=ti.f32, ndim=2)
-_Radius = ti.types.struct(
-    inverse_side=ti.f32,
-    surely=ti.f32,  # squared distances in float32 up to here are within the radius whatever the rounding
-    surely_not=ti.f32,  # and above here they are not
-    wide=ti.types.vector(4, ti.i32),  # words of two float64: the inverse of a cell's side, the radius squared
-)
-
 
 @ti.func
-def _wide(low: ti.i32, high: ti.i32) -> ti.f64:
-    """The float64 of two words."""
-    return ti.bit_cast((ti.i64(high) << 32) | ti.i64(ti.u32(low)), ti.f64)
-
-
-@ti.func
-def _cell_along(coordinate: ti.f32, radius: ti.template(), in_64_bits: ti.template()) -> ti.i32:
-    """The cell's index along an axis; where float32 has no neighbours within a cell any more, the number's own bits."""
-    cell = 0
-    if ti.static(in_64_bits):
-        scaled = ti.f64(coordinate) * _wide(radius.wide[0], radius.wide[1])
-        if ti.abs(scaled) < _LARGEST_CELL:
-            cell = ti.i32(ti.floor(scaled))
-        elif coordinate > 0.0:
-            cell = ti.bit_cast(coordinate, ti.i32)
-        else:
-            cell = -ti.bit_cast(-coordinate, ti.i32)
-    else:
-        scaled = coordinate * radius.inverse_side
-        if ti.abs(scaled) < _LARGEST_CELL:
-            cell = ti.i32(ti.floor(scaled))
-        elif coordinate > 0.0:
-            cell = ti.bit_cast(coordinate, ti.i32)
-        else:
-            cell = -ti.bit_cast(-coordinate, ti.i32)
-    return cell
-
-
-@ti.func
-def _point(rows: _Rows, i: ti.i32) -> ti.math.vec3:
-    return ti.math.vec3(rows[i, 0], rows[i, 1], rows[i, 2])
-
-
-@ti.func
-def _block_of(cells: _Table, i: ti.i32) -> ti.math.ivec3:
+def _block_of(cells: Table, i: ti.i32) -> ti.math.ivec3:
     return ti.math.ivec3(cells[i, 0] >> 2, cells[i, 1] >> 2, cells[i, 2] >> 1)
 
 
 @ti.func
-def _bit_of(cells: _Table, i: ti.i32) -> ti.i32:
+def _bit_of(cells: Table, i: ti.i32) -> ti.i32:
     """Which of a block's 32 bits stands for the cell of a point."""
     return ((cells[i, 0] & 3) << 3) | ((cells[i, 1] & 3) << 1) | (cells[i, 2] & 1)
 
@@ -94,7 +64,7 @@ def _hash_of(block: ti.math.ivec3) -> ti.i32:
 
 
 @ti.func
-def _claim(cells: _Table, i: ti.i32, table: _Integers):
+def _claim(cells: Table, i: ti.i32, table: Integers):
     """Enters a point for its block in the hash table; a lower one takes the place of a higher, which goes on."""
     mask = table.shape[0] - 1
     carried = i
@@ -118,7 +88,7 @@ def _claim(cells: _Table, i: ti.i32, table: _Integers):
 
 
 @ti.func
-def _lowest_of(cells: _Table, block: ti.math.ivec3, table: _Integers) -> ti.i32:
+def _lowest_of(cells: Table, block: ti.math.ivec3, table: Integers) -> ti.i32:
     """The lowest point of a block, `NO_POINT` if it has none."""
     mask = table.shape[0] - 1
     slot = _hash_of(block) & mask
@@ -130,167 +100,87 @@ def _lowest_of(cells: _Table, block: ti.math.ivec3, table: _Integers) -> ti.i32:
 
 
 @ti.func
-def _is_near(p: ti.math.vec3, q: ti.math.vec3, radius: ti.template(), in_64_bits: ti.template()) -> ti.i32:
-    """Whether the distance is within the radius, as float64 decides; float32 does where it is sure to agree."""
-    x = p[0] - q[0]
-    y = p[1] - q[1]
-    z = p[2] - q[2]
-    squared = x * x + y * y + z * z
-    near = ti.i32(squared <= radius.surely)
-    if ti.static(in_64_bits):  # noqa: SIM102 (one of the two is compiled away)
-        if squared > radius.surely and squared <= radius.surely_not:
-            dx = ti.f64(p[0]) - ti.f64(q[0])
-            dy = ti.f64(p[1]) - ti.f64(q[1])
-            dz = ti.f64(p[2]) - ti.f64(q[2])
-            near = ti.i32(dx * dx + dy * dy + dz * dz <= _wide(radius.wide[2], radius.wide[3]))
-    return near
-
-
-@ti.func
-def _is_by_box(p: ti.math.vec3, low: ti.math.vec3, high: ti.math.vec3, radius: ti.template()) -> ti.i32:
-    """Whether a point may be within the radius of a point in a box."""
-    x = ti.max(low[0] - p[0], p[0] - high[0], 0.0)
-    y = ti.max(low[1] - p[1], p[1] - high[1], 0.0)
-    z = ti.max(low[2] - p[2], p[2] - high[2], 0.0)
-    return x * x + y * y + z * z <= radius.surely_not
-
-
-@ti.func
-def _touch(
-    points: _Rows,
-    a_begin: ti.i32,
-    a_end: ti.i32,
-    b_begin: ti.i32,
-    b_end: ti.i32,
+def _join_levels(
+    cell: ti.math.ivec3,
+    a: ti.i32,
+    cells: Table,
+    table: Integers,
+    number: Integers,
+    bits: Integers,
+    first_cell: Integers,
+    begin: Integers,
+    size: Integers,
+    points: Rows,
     radius: ti.template(),
     in_64_bits: ti.template(),
-) -> ti.i32:
-    """Whether any point of one cell is within the radius of any point of another.
-
-    Of crowded cells, only what lies near the box of what is left of the other is tried.
-    """
-    far = ti.math.vec3(_LARGEST_FLOAT, _LARGEST_FLOAT, _LARGEST_FLOAT)
-    a_low = -far
-    a_high = far
-    b_low = -far
-    b_high = far
-    a_left = a_end - a_begin
-    b_left = b_end - b_begin
-    rounds = ti.select(ti.f32(a_left) * ti.f32(b_left) > _BRUTE_FORCE, 8, 0)
-    while rounds > 0:
-        rounds -= 1
-        left = 0
-        low = far
-        high = -far
-        for i in range(a_begin, a_end):
-            p = _point(points, i)
-            if _is_by_box(p, b_low, b_high, radius):
-                low = ti.min(low, p)
-                high = ti.max(high, p)
-                left += 1
-        narrowed = left < a_left
-        a_low = low
-        a_high = high
-        a_left = left
-        left = 0
-        low = far
-        high = -far
-        if a_left > 0:
-            for j in range(b_begin, b_end):
-                q = _point(points, j)
-                if _is_by_box(q, a_low, a_high, radius):
-                    low = ti.min(low, q)
-                    high = ti.max(high, q)
-                    left += 1
-        narrowed = narrowed or left < b_left
-        b_low = low
-        b_high = high
-        b_left = left
-        if a_left == 0 or b_left == 0 or (rounds < 7 and not narrowed):
-            rounds = 0
-    near = 0
-    i = a_begin
-    while i < a_end and near == 0 and a_left > 0 and b_left > 0:
-        p = _point(points, i)
-        if _is_by_box(p, b_low, b_high, radius):
-            j = b_begin
-            while j < b_end and near == 0:
-                near = _is_near(p, _point(points, j), radius, in_64_bits)
-                j += 1
-        i += 1
-    return near
-
-
-@ti.func
-def _find(parent: _Integers, cell: ti.i32) -> ti.i32:
-    """The root of a cell. Halves the path; a write lost to another thread leaves an ancestor all the same."""
-    root = cell
-    above = parent[root]
-    while above != root:
-        after = parent[above]
-        parent[root] = after
-        root = after
-        above = parent[root]
-    return root
-
-
-@ti.func
-def _unite(parent: _Integers, a: ti.i32, b: ti.i32):
-    """Joins two components; the lower root stays."""
-    low = _find(parent, a)
-    high = _find(parent, b)
-    while low != high:
-        if low > high:
-            swap = low
-            low = high
-            high = swap
-        there = ti.atomic_min(parent[high], low)
-        if there == high:
-            high = low
-        else:
-            # Another thread was first: what it had hung the root to belongs to us too.
-            high = _find(parent, there)
-            low = _find(parent, low)
+    # in out
+    parent: Integers,
+):
+    """Unites a cell with those of higher levels that it touches."""
+    level = level_in(cell[0])
+    for other in range(level + 1, levels_reached(cell, radius, in_64_bits) + 1):
+        first, last = cells_reached(cell, other, radius, in_64_bits)
+        for x, y, z in ti.ndrange((first[0] >> 2, (last[0] >> 2) + 1), (first[1] >> 2, (last[1] >> 2) + 1),
+                                  (first[2] >> 1, (last[2] >> 1) + 1)):  # fmt: skip
+            block = _lowest_of(cells, ti.math.ivec3(x, y, z), table)
+            left = 0
+            if block != NO_POINT:
+                block = number[block]
+                left = bits[block]
+            while left != 0:
+                bit = left & -left
+                left ^= bit
+                place = bits_of(bit - 1)
+                there = ti.math.ivec3(4 * x + (place >> 3), 4 * y + ((place >> 1) & 3), 2 * z + (place & 1))
+                b = first_cell[block] + bits_of(bits[block] & (bit - 1))
+                if (there >= first).all() and (there <= last).all() and find(parent, a) != find(parent, b):
+                    near = touch(
+                        *(points, begin[a], begin[a] + size[a], begin[b], begin[b] + size[b], level),
+                        *(radius, in_64_bits, True),
+                    )
+                    if near != 0:
+                        unite(parent, a, b)
 
 
 @ti.kernel
 def _cluster(
     # in
-    rows: _Rows,
+    rows: Rows,
     count: ti.i32,
-    include: _Integers,
+    include: Integers,
     has_include: ti.i32,
-    radius: _Radius,
+    radius: Radius,
     in_64_bits: ti.template(),
+    grows: ti.template(),
     min_size: ti.i32,
-    offsets: _Table,
-    windows: _Table,
+    offsets: Table,
+    windows: Table,
     # out: workspace
-    table: _Integers,
-    cells: _Table,
-    lowest: _Integers,
-    number: _Integers,
-    rank: _Integers,
-    cell_of_point: _Integers,
-    bits: _Integers,
-    block_point: _Integers,
-    first_cell: _Integers,
-    size: _Integers,
-    begin: _Integers,
-    points: _Rows,
-    parent: _Integers,
-    members: _Integers,
-    cell_lowest: _Integers,
-    sums: _Integers,
+    table: Integers,
+    cells: Table,
+    lowest: Integers,
+    number: Integers,
+    rank: Integers,
+    cell_of_point: Integers,
+    bits: Integers,
+    block_point: Integers,
+    first_cell: Integers,
+    size: Integers,
+    begin: Integers,
+    points: Rows,
+    parent: Integers,
+    members: Integers,
+    cell_lowest: Integers,
+    sums: Integers,
     # out
-    totals: _Integers,
-    labels: _Integers,
+    totals: Integers,
+    labels: Integers,
 ):
     for slot in range(table.shape[0]):
         table[slot] = NO_POINT
     # Blocks, by their lowest point.
     for i in range(count):
-        p = _point(rows, i)
+        p = point_of(rows, i)
         takes_part = (
             ti.abs(p[0]) <= _LARGEST_FLOAT and ti.abs(p[1]) <= _LARGEST_FLOAT and ti.abs(p[2]) <= _LARGEST_FLOAT
         )
@@ -298,8 +188,9 @@ def _cluster(
             takes_part = takes_part and include[i] != 0
         lowest[i] = ti.select(takes_part, 0, -1)
         if takes_part:
+            cell = cell_of(p, radius, in_64_bits, grows)
             for k in ti.static(range(3)):
-                cells[i, k] = _cell_along(p[k], radius, in_64_bits)
+                cells[i, k] = cell[k]
     for i in range(count):
         if lowest[i] >= 0:
             _claim(cells, i, table)
@@ -367,19 +258,37 @@ def _cluster(
                     b_bit = b_bits & -b_bits
                     b_bits ^= b_bit
                     b = first_cell[b_block] + bits_of(bits[b_block] & (b_bit - 1))
-                    if _find(parent, a) != _find(parent, b):
-                        near = _touch(
-                            *(points, begin[a], begin[a] + size[a], begin[b], begin[b] + size[b], radius, in_64_bits)
+                    if find(parent, a) != find(parent, b):
+                        near = touch(
+                            *(points, begin[a], begin[a] + size[a], begin[b], begin[b] + size[b]),
+                            *(level_in(4 * block[0]), radius, in_64_bits, grows),
                         )
                         if near != 0:
-                            _unite(parent, a, b)
+                            unite(parent, a, b)
+                a += 1
+    # And with cells of other levels.
+    if ti.static(grows):
+        for b in range(totals[_BLOCKS]):
+            left = bits[b]
+            a = first_cell[b]
+            while left != 0:
+                bit = left & -left
+                left ^= bit
+                place = bits_of(bit - 1)
+                block = _block_of(cells, block_point[b])
+                cell = ti.math.ivec3(
+                    4 * block[0] + (place >> 3), 4 * block[1] + ((place >> 1) & 3), 2 * block[2] + (place & 1)
+                )
+                _join_levels(
+                    *(cell, a, cells, table, number, bits, first_cell, begin, size, points, radius, in_64_bits, parent)
+                )
                 a += 1
     # Labels.
     for c in range(totals[_CELLS]):
-        ti.atomic_add(members[_find(parent, c)], size[c])
+        ti.atomic_add(members[find(parent, c)], size[c])
     for i in range(count):
         if cell_of_point[i] >= 0:
-            root = _find(parent, cell_of_point[i])
+            root = find(parent, cell_of_point[i])
             cell_of_point[i] = root
             if cell_lowest[root] > i:
                 ti.atomic_min(cell_lowest[root], i)
@@ -417,6 +326,8 @@ class EuclideanCluster:
 
     radius: float
     """Longest step [m] that joins two points."""
+    radius_per_metre: float = 0.0
+    """By how much it grows per metre of range, 0 or 1e-5 … 1: two points then go by the one nearer to the origin."""
     min_size: int = 1
     """Points that make a cluster; smaller ones get the label -1."""
     capacity: int
@@ -435,6 +346,11 @@ class EuclideanCluster:
             raise ValueError(
                 f"radius must be a positive number of metres (at least {_SMALLEST_RADIUS}), not {self.radius}"
             )
+        if self.radius_per_metre != 0 and not _LEAST_GROWTH <= self.radius_per_metre <= 1:
+            raise ValueError(
+                f"radius_per_metre must be 0, or from {_LEAST_GROWTH} to 1 metre per metre of range, "
+                f"not {self.radius_per_metre}"
+            )
         for name in ("min_size", "capacity"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -446,18 +362,7 @@ class EuclideanCluster:
         with launching:
             in_64_bits = has_64_bits()
             keep("_in_64_bits", in_64_bits)
-            # A hair shorter, so that no rounding makes the diagonal longer than the radius.
-            inverse_side = math.sqrt(3.0) / (self.radius * (1.0 - 1e-6))
-            squared = self.radius * self.radius
-            keep(
-                "_radius",
-                _Radius(
-                    inverse_side=math.sqrt(3.0) / (self.radius * (1.0 - 1e-3)),
-                    surely=squared * (1.0 - 1e-6) if in_64_bits else squared,
-                    surely_not=squared * (1.0 + 1e-6),
-                    wide=np.array([inverse_side, squared]).view(np.int32).tolist(),
-                ),
-            )
+            keep("_radius", radius_of(self.radius, self.radius_per_metre, in_64_bits))
             for name, values in zip(("_offsets", "_windows"), _neighbours(), strict=True):
                 array = workspace(values.shape, ti.i32)
                 array.from_numpy(values)
@@ -496,6 +401,7 @@ class EuclideanCluster:
                 *(
                     self._radius,
                     self._in_64_bits,
+                    self.radius_per_metre > 0,
                     self.min_size,
                     self._offsets,
                     self._windows,
@@ -508,11 +414,18 @@ class EuclideanCluster:
             )
 
 
-def cluster(points: Points, radius: float, min_size: int) -> Any:
-    """As `kernels.cluster.cluster` with one radius everywhere, for points that are borrowed already."""
+def cluster(points: Points, radius: float, min_size: int, radius_per_metre: float = 0.0) -> Any:
+    """As `kernels.cluster.cluster`, for points that are borrowed already."""
     device = start()
     n = len(points)
-    plan = plan_for(EuclideanCluster, radius=radius, min_size=min_size, capacity=capacity_for(n), device=device)
+    plan = plan_for(
+        EuclideanCluster,
+        radius=radius,
+        radius_per_metre=radius_per_metre,
+        min_size=min_size,
+        capacity=capacity_for(n),
+        device=device,
+    )
     labels = np.zeros(max(n, 1), np.int32)
     plan._launch_into(rows_of(points), n, None, labels)
     return give_back(labels[:n], points)

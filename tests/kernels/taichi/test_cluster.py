@@ -36,6 +36,46 @@ def test_points_on_a_lattice(seed, n, step):
     check((cells * np.float32(step)), step)
 
 
+def check_growing(points, radius, radius_per_metre, min_size=1):
+    from warploom.kernels.interop import borrow_points
+    from warploom.kernels.taichi.cluster import cluster as in_taichi
+
+    ours = in_taichi(borrow_points(points), radius, min_size, radius_per_metre)
+    np.testing.assert_array_equal(ours, cluster(points, radius, min_size, radius_per_metre=radius_per_metre))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 3000),
+    st.sampled_from([0.05, 0.3, 1.3]),
+    st.sampled_from([1e-5, 0.004, 0.02, 0.2, 1.0]),
+    st.sampled_from([1, 3]),
+)
+def test_a_radius_that_grows_with_the_range(normal, seed, n, radius, radius_per_metre, min_size):
+    check_growing(normal(seed, n), radius, radius_per_metre, min_size)
+
+
+@pytest.mark.parametrize("radius_per_metre", [0.01, 0.5])
+def test_awkward_clouds_under_a_growing_radius(awkward, radius_per_metre):
+    check_growing(awkward, 0.2, radius_per_metre)
+
+
+def test_of_two_radii_that_of_the_nearer_point_holds():
+    """Points 20 m and 21 m away, whose nearer one just reaches the other, and just does not."""
+    for reach, joined in ((1.0 + 1e-6, True), (1.0 - 1e-6, False)):
+        near = np.float32([[20.0, 0.0, 0.0], [21.0, 0.0, 0.0]])
+        growth = (reach - 0.3) / 20.0
+        check_growing(near, 0.3, growth)
+        assert cluster(near, 0.3, radius_per_metre=growth).tolist() == [0, 0 if joined else 1]
+
+
+def test_a_simulated_sweep_under_a_growing_radius(street):
+    points = street[~segment_ground(street).mask]
+    check_growing(points, 0.3, 0.02)
+    check_growing(points, 0.1, 0.01, 5)
+
+
 @pytest.mark.parametrize("radius", [0.01, 0.5, 100.0])
 def test_awkward_clouds(awkward, radius):
     check(awkward, radius, 1)
@@ -55,7 +95,9 @@ def test_a_simulated_sweep(street):
 @pytest.mark.real
 def test_real_sweeps(scans):
     for scan in scans:
-        check(scan[~segment_ground(scan).mask])
+        points = scan[~segment_ground(scan).mask]
+        check(points)
+        check_growing(points, 0.3, 0.02)
 
 
 def test_labels_are_the_same_each_time(street):
@@ -72,6 +114,9 @@ def test_without_64_bit_numbers(street, monkeypatch):
     plan = in_taichi.EuclideanCluster(radius=0.4567, capacity=len(street))
     plan.launch(street, len(street))
     np.testing.assert_array_equal(plan.labels.to_numpy(), cluster(street, 0.4567))
+    plan = in_taichi.EuclideanCluster(radius=0.4567, radius_per_metre=0.0123, capacity=len(street))
+    plan.launch(street, len(street))
+    np.testing.assert_array_equal(plan.labels.to_numpy(), cluster(street, 0.4567, radius_per_metre=0.0123))
 
 
 def test_points_that_take_no_part(normal):
@@ -95,6 +140,8 @@ def test_points_that_take_no_part(normal):
     [
         ({"radius": 0.0}, "radius must be a positive number"),
         ({"radius": float("inf")}, "radius must be a positive number"),
+        ({"radius_per_metre": 2.0}, "radius_per_metre must be 0, or from 1e-05 to 1"),
+        ({"radius_per_metre": float("nan")}, "radius_per_metre must be 0, or from 1e-05 to 1"),
         ({"min_size": 0}, "min_size must be at least 1"),
         ({"capacity": 0}, "capacity must be at least 1"),
         ({"device": "taichi:abacus"}, "device must be 'taichi'"),
