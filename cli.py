@@ -138,20 +138,19 @@ def check(
 
 @app.command()
 def graph(
-    file: Annotated[str, typer.Argument(help="A module file, or the name of one.")] = "perception",
-    form: Annotated[str, typer.Option("--format", help="text or mermaid.")] = "text",
+    file: Annotated[str, typer.Argument(help="A module or a profile: a YAML file, or a name.")] = "perception",
+    form: Annotated[str, typer.Option("--format", help="text, mermaid or svg.")] = "text",
+    settings: Settings = None,
 ) -> None:
-    """Draw the components of a module file and the vertices of their graphs.
+    """Draw the components of a module file, or of all those of a profile, and the vertices of their graphs.
 
-    Example: `warploom graph perception --format mermaid`
+    Example: `warploom graph perception --format svg > perception.svg`
     """
-    from .components.profile import CONF
-    from .dag import draw_mermaid, draw_text, find_config, load_module
+    from .components.checking import FORMATS, draw_file
 
-    drawers = {"text": draw_text, "mermaid": draw_mermaid}
-    if form not in drawers:
-        raise typer.BadParameter(f"{form!r} is neither text nor mermaid", param_hint="--format")
-    typer.echo(drawers[form](load_module(find_config(file, "modules", CONF)).content))
+    if form not in FORMATS:
+        raise typer.BadParameter(f"{form!r} is neither text nor mermaid nor svg", param_hint="--format")
+    typer.echo(draw_file(file, form, settings or ()).rstrip())
 
 
 @app.command()

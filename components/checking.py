@@ -1,18 +1,22 @@
-"""Validates configuration files without running them."""
+"""Validates configuration files, and draws them, without running them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
 
-from ..dag import Process, find_config, load_module, parse_overrides
+from ..dag import Process, draw_mermaid, draw_svg, draw_text, find_config, load_module, parse_overrides
+from ..dag.graph import declare_vertices
 from ..errors import ConfigError
 from .execution import ExecutionContext
 from .messages import SensorFrame
-from .pipeline import LIDAR_TOPIC, Pipeline
-from .profile import CONF
+from .pipeline import LIDAR_TOPIC, Pipeline, profile_modules
+from .profile import CONF, load_profile
 
-__all__ = ["check_file"]
+__all__ = ["FORMATS", "check_file", "draw_file"]
+
+FORMATS = {"text": draw_text, "mermaid": draw_mermaid, "svg": draw_svg}
+"""How a module can be drawn."""
 
 
 def check_file(name: str, settings: Iterable[str] = ()) -> list[str]:
@@ -48,8 +52,32 @@ def check_file(name: str, settings: Iterable[str] = ()) -> list[str]:
     return lines
 
 
-def _find(name: str) -> tuple[Path, str]:
-    """The file, and whether it belongs to the profiles or the modules."""
+def draw_file(name: str, form: str = "text", settings: Iterable[str] = ()) -> str:
+    """Draws a module file, or all the modules of a profile.
+
+    Args:
+        name: The path of a YAML file, or the name of a module or a profile.
+        form: One of `FORMATS`.
+        settings: Changes by dotted key, as texts `key=value`.
+
+    Raises:
+        ConfigError: Something is wrong in one of the files.
+    """
+    path, kind = _find(name, first="modules")
+    changes = {tuple(key.split(".")): value for key, value in parse_overrides(settings).items()}
+    if kind == "profiles":
+        files = profile_modules(load_profile(str(path)), changes)
+    else:
+        files = [load_module(path, changes)]
+    for file in files:
+        for index, component in enumerate(file.content.components):
+            if component.graph:
+                declare_vertices(file, ["components", index], component)
+    return FORMATS[form](*(file.content for file in files))
+
+
+def _find(name: str, first: str = "profiles") -> tuple[Path, str]:
+    """The file, and whether it belongs to the profiles or the modules; a name is looked for in `first` first."""
     direct = Path(name)
     if direct.suffix in (".yaml", ".yml"):
         if not direct.is_file():
@@ -61,7 +89,11 @@ def _find(name: str) -> tuple[Path, str]:
         if "module" in top:
             return direct, "modules"
         raise ConfigError(f"{direct}:1: has neither a key 'profile' nor a key 'module', so it is not of a known kind")
+    second = "modules" if first == "profiles" else "profiles"
     try:
-        return find_config(name, "profiles", CONF), "profiles"
-    except ConfigError:
-        return find_config(name, "modules", CONF), "modules"
+        return find_config(name, first, CONF), first
+    except ConfigError as error:
+        try:
+            return find_config(name, second, CONF), second
+        except ConfigError as other:
+            raise ConfigError(f"{error}; {other}") from None

@@ -165,13 +165,12 @@ class Pipeline:
         changes = {tuple(key.split(".")): value for key, value in overrides.items()}
         of_profile = {keys[1:]: value for keys, value in changes.items() if keys[0] == "profile"}
         profile = load_profile(name, of_profile)
-        in_profile = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
-        of_modules = {**in_profile, **{keys: value for keys, value in changes.items() if keys[0] != "profile"}}
-        modules = [load_module(_find_module(profile, module), of_modules) for module in profile.content.modules]
+        of_modules = {keys: value for keys, value in changes.items() if keys[0] != "profile"}
+        modules = profile_modules(profile, of_modules)
         components = [component for module in modules for component in module.content.components]
         if workers is not None:
             graphs = {(one.name, key): workers for one in components if one.graph for key in ("workers", "in_flight")}
-            modules = [load_module(module.path, {**of_modules, **graphs}) for module in modules]
+            modules = profile_modules(profile, {**of_modules, **graphs})
         known = {component.name for component in components}
         for keys in of_modules:
             if keys[0] not in known:
@@ -270,6 +269,23 @@ class Pipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def profile_modules(
+    profile: ConfigFile[Profile], changes: Mapping[tuple[str, ...], Any]
+) -> list[ConfigFile[ModuleSpec]]:
+    """The modules of a profile with its settings, and with changes that come before those.
+
+    Raises:
+        ConfigError: A module is not there, or bad, or a setting is for none of their components.
+    """
+    settings = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
+    files = [load_module(_find_module(profile, name), {**settings, **changes}) for name in profile.content.modules]
+    known = {component.name for file in files for component in file.content.components}
+    for key in profile.content.settings:
+        if key.split(".")[0] not in known:
+            raise profile.error(["settings", key], f"no component {key.split('.')[0]!r}; {nearest(key, known)}")
+    return files
 
 
 def _find_module(profile: ConfigFile[Profile], name: str) -> Path:

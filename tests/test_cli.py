@@ -104,7 +104,7 @@ def test_frames_limits_the_run(warploom, scans, tmp_path):
         (["run", "--source", "sim:street", "--set", "perception.cluster.radius"], 2, "expected key=value"),
         (["run", "--source", "sim:street", "--set", "perception.cluster.radius=-2"], 2, "greater than 0"),
         (["check", "missing.yaml"], 2, "there is no such file"),
-        (["graph", "perception", "--format", "jpeg"], 2, "neither text nor mermaid"),
+        (["graph", "perception", "--format", "jpeg"], 2, "neither text nor mermaid nor svg"),
         (["--log-level", "loud", "info"], 2, "none of debug"),
     ],
 )
@@ -143,12 +143,42 @@ def test_graph_draws_text_and_mermaid(warploom):
     assert "c_perception_filter -- filtered --> c_perception_ground" in mermaid
 
 
+def test_graph_draws_a_picture_of_a_module_or_a_whole_profile(warploom):
+    import xml.etree.ElementTree as ET
+
+    for name in ("perception", "cpu", "gpu"):
+        picture = ET.fromstring(warploom("graph", name, "--format", "svg"))
+        texts = {text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")}
+        assert {"lidar/points", "filter", "track", "perception (dag)", "perception/obstacles"} <= texts
+
+
+def test_a_recorded_run_is_replayed_and_played(warploom, tmp_path):
+    output = warploom("record", "--source", "sim:street?seed=7&duration=0.5", "--out", "a.mcap")
+    assert "a.mcap: 5 frames, 20 commits" in output
+    output = warploom("replay", "a.mcap", "--verify", "--workers", 1, "--workers", 2, "--workers", 8)
+    assert output.count("bit-exact: all 15 commits have the recorded hashes") == 3
+    assert "8 workers: given 5 of lidar/points" in output
+    output = warploom("replay", "a.mcap", "--verify", "--set", "perception.cluster.min_size=11", expect=1)
+    assert "NOT bit-exact" in output
+    assert "differs" in output
+    output = warploom("play", "a.mcap", "--fast", "--seek", 0.2, "--loop", 2, "--topic", "lidar/points")
+    assert "played 6 of lidar/points" in output
+    assert warploom("info", "a.mcap").count("warploom.SensorFrame") == 1
+
+
+@pytest.mark.parametrize("command", ["replay", "play"])
+def test_a_file_that_is_no_recording_is_refused(warploom, tmp_path, command):
+    (tmp_path / "a.mcap").write_bytes(b"nothing")
+    assert "a.mcap: is no recording that" in warploom(command, "a.mcap", expect=1)
+    assert "No such file" in warploom(command, "b.mcap", expect=1)
+
+
 def test_info_tells_the_machine_or_what_a_file_holds(warploom, scans):
     assert "warp-lang" in warploom("info")
     assert "4" in warploom("info", scans)
 
 
-@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph", "bench"])
+@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph", "record", "play", "replay", "bench"])
 def test_every_command_has_help_with_an_example(warploom, command):
     assert "Example:" in warploom(command, "--help")
 
