@@ -4,16 +4,20 @@ from ..datamesh import Status
 from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
 from .configuration import ConfigFile, find_config, import_class, nearest, parse_overrides
+from .deadline import DeadlineConfig
 from .drawing import draw_mermaid, draw_text
 from .engine import GraphEngine, Run, Vertex, VertexTiming
+from .flags import YamlFlags
 from .process import Process, load_module
 from .processor import In, Out, Processor, ProcessorConfig, ProcessorHarness
-from .schema import ComponentSpec, ModuleSpec, VertexSpec
+from .schema import ComponentSpec, FlagLoaderSpec, ModuleSpec, VertexSpec
 from .svg import draw_svg
-from .sync import CommitDagProcessor
-from .trigger import Trigger
+from .sync import AlignDagProcessor, Aligned, CommitDagProcessor, GetRecentDagProcessor
+from .trigger import Trigger, TriggerConfig
 
 __all__ = [
+    "AlignDagProcessor",
+    "Aligned",
     "BacklogConfig",
     "CommitDagProcessor",
     "Component",
@@ -21,7 +25,10 @@ __all__ = [
     "ConfigFile",
     "DagComponent",
     "DataProcessComponent",
+    "DeadlineConfig",
+    "FlagLoaderSpec",
     "GenericComponent",
+    "GetRecentDagProcessor",
     "GraphEngine",
     "In",
     "ModuleSpec",
@@ -34,9 +41,11 @@ __all__ = [
     "Run",
     "Status",
     "Trigger",
+    "TriggerConfig",
     "Vertex",
     "VertexSpec",
     "VertexTiming",
+    "YamlFlags",
     "draw_mermaid",
     "draw_svg",
     "draw_text",

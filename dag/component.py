@@ -5,15 +5,27 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel
 
-from ..datamesh import DataMesh, Entry, Input, LossCounters, Output, Status, declared_handles
+from ..datamesh import (
+    CURRENT_EPOCH,
+    Clock,
+    DataMesh,
+    Input,
+    LossCounters,
+    Output,
+    Status,
+    SystemClock,
+    declared_handles,
+)
 from .backlog import Backlog, BacklogConfig
+from .deadline import DeadlineConfig, FrameDeadline
 from .engine import GraphEngine, Run, Vertex, VertexTiming
 from .processor import ProcessorConfig
-from .trigger import Trigger
+from .trigger import Trigger, TriggerConfig
+from .triggering import AllTrigger, AnyTrigger, TimeTrigger, TriggerSource
 
 __all__ = [
     "Component",
@@ -47,10 +59,14 @@ class Component:
             (self.inputs if isinstance(handle, Input) else self.outputs)[handle_name] = handle  # type: ignore[assignment]
             setattr(self, handle_name, handle)
         self.losses = LossCounters()
+        self.clock: Clock = SystemClock()
+        self.flags: Mapping[str, Any] = {}
+        """What the flag loaders of the process found."""
 
     def bind(self, mesh: DataMesh, topics: Mapping[str, str]) -> None:
         """Connects the handles to their topics in the mesh."""
         self.losses = mesh.losses
+        self.clock = mesh.clock
         for name, handle in (*self.inputs.items(), *self.outputs.items()):
             handle.bind(name, mesh.window(topics[name]))
 
@@ -89,74 +105,171 @@ class GenericComponent(Component):
 
 
 class DataProcessComponent(Component):
-    """Computes: reads and writes the mesh, once for each message on its trigger input.
+    """Computes: reads and writes the mesh, once for each trigger.
 
     A subclass declares handles and overrides `process`. An exception in it costs that frame, is counted and logged.
     """
 
+    stop_timeout_s: ClassVar[float] = 30.0
+    """How long the frames that wait or run may take when it stops; what hangs longer is left to itself, and counted."""
+
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
-        self.trigger_input: str | None = None
+        self.trigger_inputs: tuple[str, ...] = ()
         self._backlog: Backlog | None = None
+        self._source = TriggerSource()
+        self._inline = False
         self._thread: threading.Thread | None = None
+        self._serving = threading.Lock()
+        self._running: Trigger | None = None
+
+    @property
+    def trigger_input(self) -> str | None:
+        """The input whose versions are those of the triggers; None where time gives them."""
+        return self.trigger_inputs[0] if self.trigger_inputs else None
 
     def process(self, trigger: Trigger) -> Status:
         """Runs for one trigger."""
         raise NotImplementedError
 
-    def set_trigger(self, input_name: str, backlog: BacklogConfig) -> None:
-        """Makes each commit to an input a trigger. The component must be bound."""
-        self.trigger_input = input_name
+    def set_trigger(
+        self,
+        trigger: TriggerConfig | str,
+        backlog: BacklogConfig,
+        hand_off: Literal["thread", "inline"] = "thread",
+    ) -> None:
+        """Says what starts a run. The component must be bound.
+
+        Args:
+            trigger: Which events do, or the name of the one input whose commits do.
+            backlog: What happens when they come faster than it runs; triggers of time wait by their `overrun`.
+            hand_off: thread: it runs in a thread of its own; inline: in the thread that commits, which for that long
+                does not come back from its commit.
+        """
+        config = TriggerConfig.model_validate(trigger)
+        self._inline = hand_off == "inline"
+        self.trigger_inputs = config.inputs
+        if config.period_ms is not None:
+            backlog = BacklogConfig()
+            coalesce = config.overrun == "coalesce"
+            self._source = TimeTrigger(
+                self.clock,
+                self._offer,
+                period_ns=round(config.period_ms * 1e6),
+                is_busy=lambda: not coalesce and self._is_busy(),
+                place=self.name,
+                losses=self.losses,
+            )
         self._backlog = Backlog(self.name, backlog, self.losses)
-        window = self.inputs[input_name].window
-        window.subscribe(self._on_commit, self._on_settle)
-
-    def _on_commit(self, entry: Entry) -> None:
-        self._offer(Trigger(entry.version, entry.received_ns, settled=not entry.triggers))
-
-    def _on_settle(self, version: int, epoch: int) -> None:
-        self._offer(Trigger(version, settled=True))
+        inputs = {name: self.inputs[name] for name in config.inputs}
+        if config.any:
+            self._source = AnyTrigger(inputs, self._offer)
+        elif config.all:
+            tolerance = round(config.tolerance_ms * 1e6)
+            self._source = AllTrigger(inputs, self._offer, tolerance_ns=tolerance, place=self.name, losses=self.losses)
 
     def _offer(self, trigger: Trigger) -> None:
-        if self._backlog is not None:
-            dropped = self._backlog.offer(trigger)
-            if dropped is not None:
-                self.settle(dropped.version)
+        assert self._backlog is not None
+        dropped = self._backlog.offer(trigger)
+        if dropped is not None:
+            self.settle(dropped.version, dropped.epoch)
+        if dropped is not trigger:
+            self._advance()
 
-    def settle(self, version: int) -> None:
+    def _advance(self) -> None:
+        """Goes on with what waits, in the calling thread, where that is how it runs."""
+        if self._inline:
+            self._serve_inline()
+
+    def _is_busy(self) -> bool:
+        return self._running is not None or bool(self._backlog)
+
+    def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
         """Says on every output that was not committed at `version` that there will be nothing."""
         for output in self.outputs.values():
-            output.settle(version)
+            output.settle(version, epoch)
 
     def start(self) -> None:
-        """Starts the thread that serves the triggers."""
+        """Starts the thread that serves the triggers, and the ticks where time triggers. After a stop, once more.
+
+        Raises:
+            RuntimeError: What ran at the last stop still hangs.
+        """
+        if self._running is not None:
+            raise RuntimeError(f"{self.name} cannot start again: it hangs at version {self._running.version}")
+        for handle in self.inputs.values():
+            handle.allow_waits()
         if self._backlog is not None:
+            self._backlog.open()
+            self._start_serving()
+        self._source.start()
+
+    def _start_serving(self) -> None:
+        if not self._inline:
             self._thread = threading.Thread(target=self._serve, name=self.name, daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
-        """Serves what waits, then ends the thread."""
+        """Serves what waits, then ends the thread. Waits for data end at once, with SHUTDOWN."""
+        self._source.stop()
         if self._backlog is not None:
             self._backlog.close()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        for handle in self.inputs.values():
+            handle.end_waits()
+        self._finish()
+        for output in self.outputs.values():
+            if output.is_bound:
+                output.flush()
+
+    def _finish(self) -> None:
+        """Waits until all is served."""
+        if self._inline:
+            if self._serving.acquire(timeout=self.stop_timeout_s):
+                self._serving.release()
+            self._serve_inline()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join(self.stop_timeout_s)
+        running = self._running
+        if running is not None:
+            self._hangs({"process": running.version})
+
+    def _hangs(self, where: Mapping[str, int]) -> None:
+        for part, version in where.items():
+            _log.error("%s: %s hangs at version %d since the stop, and is left to itself", self.name, part, version)
+            self.losses.count(self.name, "hung", version)
 
     def _serve(self) -> None:
         assert self._backlog is not None
         while (trigger := self._backlog.take()) is not None:
-            if trigger.settled:
-                self.settle(trigger.version)
-            else:
-                self._run(trigger)
+            self._run(trigger)
+
+    def _serve_inline(self) -> None:
+        """Serves what waits, unless another thread does that already, which then serves it too."""
+        assert self._backlog is not None
+        while len(self._backlog) and self._serving.acquire(blocking=False):
+            try:
+                while (trigger := self._backlog.take_now()) is not None:
+                    self._run(trigger)
+            finally:
+                self._serving.release()
 
     def _run(self, trigger: Trigger) -> None:
+        if trigger.settled:
+            self.settle(trigger.version, trigger.epoch)
+            return
+        self._running = trigger
+        for handle in self.outputs.values():
+            handle.epoch = trigger.epoch
+        for name in self.trigger_inputs:
+            self.inputs[name].epoch = trigger.epoch
         try:
             self.process(trigger)
         except BaseException:  # also SystemExit: only the process as a whole may end the thread
             _log.exception("%s failed at version %d", self.name, trigger.version)
             self.losses.count(self.name, "failed", trigger.version)
-        self.settle(trigger.version)
+        self.settle(trigger.version, trigger.epoch)
+        self._running = None
 
 
 class DagComponent(DataProcessComponent):
@@ -169,7 +282,11 @@ class DagComponent(DataProcessComponent):
         super().__init__(name, context)
         self._engine: GraphEngine | None = None
         self._vertices: Sequence[Vertex] = ()
-        self._slots = threading.Semaphore(1)
+        self._deadline: DeadlineConfig | None = None
+        self._closed = False
+        self._submitting = threading.Lock()
+        self._free = 1
+        self._idle = threading.Condition()
         self.in_flight = 1
 
     def add_handles(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -186,70 +303,120 @@ class DagComponent(DataProcessComponent):
         workers: int,
         in_flight: int,
         on_timing: Callable[[VertexTiming], None] | None = None,
+        deadline: DeadlineConfig | None = None,
     ) -> None:
         """Sets the vertices, initialised, and how many frames may be in the graph at once."""
         if self.max_in_flight is not None:
             in_flight = min(in_flight, self.max_in_flight)
         self._vertices = vertices
-        self.in_flight = in_flight
-        self._slots = threading.Semaphore(in_flight)
+        self._deadline = deadline
+        self.in_flight = self._free = in_flight
         self._engine = GraphEngine(self.name, vertices, workers, on_timing)
 
     def start(self) -> None:
-        """Starts the workers and the thread that serves the triggers."""
+        """Starts the workers. After a stop, initialises the processors once more first."""
         assert self._engine is not None, "set_graph comes first"
+        if self._closed:
+            for vertex in self._vertices:
+                vertex.processor.init(vertex.config)
+            self._closed = False
         self._engine.start()
         super().start()
 
-    def stop(self) -> None:
-        """Finishes the frames that wait or are in flight, then stops."""
-        super().stop()
-        for _ in range(self.in_flight):
-            self._slots.acquire()
-        self._slots.release(self.in_flight)
-        if self._engine is not None:
-            self._engine.stop()
-        for vertex in self._vertices:
-            try:
-                vertex.processor.close()
-            except Exception:
-                _log.exception("%s.%s failed to close", self.name, vertex.name)
+    def _start_serving(self) -> None:
+        """The workers do that."""
 
-    def _serve(self) -> None:
-        assert self._backlog is not None
-        while True:
-            # The slot comes first: while none is free, triggers wait in the backlog, where its policy rules.
-            self._slots.acquire()
-            trigger = self._backlog.take()
-            if trigger is None or trigger.settled or not self._submit(trigger):
-                self._slots.release()
-            if trigger is None:
-                return
-            if trigger.settled:
-                self.settle(trigger.version)
-
-    def _submit(self, trigger: Trigger) -> bool:
-        """Starts the graph for a trigger, or settles it; tells whether it started."""
+    def _finish(self) -> None:
+        """Finishes the frames that wait or are in flight, and closes the processors."""
         assert self._engine is not None
-        assert self.trigger_input is not None
-        with self.inputs[self.trigger_input].access() as snapshot:
-            index = snapshot.version_index(trigger.version)
-            if index < 0:
-                miss = snapshot.miss(trigger.version)
-                self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
-                self.settle(trigger.version)
-                return False
-            data = {self.trigger_input: snapshot[index]}
-        self._engine.submit(trigger, data, self._done)
-        return True
+        assert self._backlog is not None
+        backlog = self._backlog
+        self._advance()
+        with self._idle:
+            finished = self._idle.wait_for(
+                lambda: self._free == self.in_flight and not len(backlog), self.stop_timeout_s
+            )
+        hanging = {} if finished else self._engine.running()
+        if self._engine.stop(None if finished else 0.1):
+            hanging = {}
+        self._hangs(hanging)
+        while (trigger := backlog.take_now()) is not None:  # behind one that hangs
+            self.losses.count(self.name, "shutdown", trigger.version)
+            self.settle(trigger.version, trigger.epoch)
+        for vertex in self._vertices:
+            if vertex.name not in hanging:
+                self._close(vertex)
+        self._closed = True
+
+    def _close(self, vertex: Vertex) -> None:
+        try:
+            vertex.processor.close()
+        except Exception:
+            _log.exception("%s.%s failed to close", self.name, vertex.name)
+
+    def _is_busy(self) -> bool:
+        return self._free == 0 or bool(self._backlog)
+
+    def _advance(self) -> None:
+        self._submit_waiting(serves=self._inline)
+        if self._inline and self._engine is not None:
+            self._engine.serve()
+
+    def _submit_waiting(self, *, serves: bool) -> None:
+        """Submits what waits, while there is room in the graph; who calls says whether it serves the graph next."""
+        assert self._backlog is not None
+        assert self._engine is not None
+        while len(self._backlog) and self._free > 0:
+            with self._submitting:  # frames enter in their order
+                # While no slot is free, triggers wait in the backlog, where its policy rules.
+                trigger = self._backlog.take_now() if self._free > 0 else None
+                if trigger is None:
+                    return
+                if trigger.settled:
+                    self.settle(trigger.version, trigger.epoch)
+                else:
+                    self._submit(trigger, serves)
+
+    def _submit(self, trigger: Trigger, serves: bool) -> None:
+        """Starts the graph for a trigger, or settles it. Called by one thread at a time."""
+        assert self._engine is not None
+        data = self._data(trigger)
+        if data is None:
+            self.settle(trigger.version, trigger.epoch)
+            return
+        with self._idle:
+            self._free -= 1
+        deadline = None
+        if self._deadline is not None:
+            deadline = FrameDeadline(self._deadline, trigger, self.clock, self.settle)
+        self._engine.submit(trigger, data, self._done, deadline, serves=serves)
+
+    def _data(self, trigger: Trigger) -> dict[str, Any] | None:
+        """The data that triggered, by input; None, counted, where they are gone."""
+        data: dict[str, Any] = {}
+        for name, version in trigger.inputs.items():
+            with self.inputs[name].access(trigger.epoch, getattr(self.context, "stream", None)) as snapshot:
+                index = snapshot.version_index(version)
+                if index < 0:
+                    miss = snapshot.miss(version)
+                    self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
+                    return None
+                data[name] = snapshot[index]
+        return data
 
     def _done(self, run: Run) -> None:
+        trigger = run.trigger
+        if run.deadline is not None and run.deadline.end():
+            self.losses.count(self.name, "deadline", trigger.version)
         if run.error is not None:
-            self.losses.count(f"{self.name}.{run.failed_vertex}", "failed", run.trigger.version)
+            self.losses.count(f"{self.name}.{run.failed_vertex}", "failed", trigger.version)
         try:
-            self.settle(run.trigger.version)
+            self.settle(trigger.version, trigger.epoch)
         finally:
-            self._slots.release()
+            with self._idle:
+                self._free += 1
+                self._idle.notify_all()
+            self._submit_waiting(serves=True)
 
 
 class MonotonicDagComponent(DagComponent):
@@ -259,12 +426,13 @@ class MonotonicDagComponent(DagComponent):
 
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
-        self._last_started = -1
+        self._last_started = (-1, -1)
 
-    def _submit(self, trigger: Trigger) -> bool:
-        if trigger.version <= self._last_started:
+    def _submit(self, trigger: Trigger, serves: bool) -> None:
+        order = (trigger.epoch, trigger.version)
+        if order <= self._last_started:
             self.losses.count(self.name, "out_of_order", trigger.version)
-            self.settle(trigger.version)
-            return False
-        self._last_started = trigger.version
-        return super()._submit(trigger)
+            self.settle(trigger.version, trigger.epoch)
+            return
+        self._last_started = order
+        super()._submit(trigger, serves)

@@ -2,20 +2,22 @@
 
 A vertex is one processor. It starts as soon as its inputs are there, serves one frame at a time, and takes the frames
 in the order of their versions; so whatever it keeps from frame to frame, and the order of what it commits, do not
-depend on how many workers there are.
+depend on how many workers there are. A vertex that waits for data of the mesh gives its worker back meanwhile.
 """
 
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..datamesh import Status
+from .deadline import FrameDeadline
 from .processor import Processor
 from .trigger import Trigger
 
@@ -24,8 +26,7 @@ __all__ = ["GraphEngine", "Run", "Vertex", "VertexTiming"]
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class VertexTiming:
+class VertexTiming(NamedTuple):
     """How one vertex ran for one frame; times from `time.perf_counter_ns`."""
 
     component: str
@@ -36,10 +37,13 @@ class VertexTiming:
     start_ns: int
     end_ns: int
     status: Status
+    late: bool = False
+    """Whether it ended later after `ready_ns` than its deadline allows."""
+    epoch: int = 0
 
     @property
     def wait_ms(self) -> float:
-        """Time in the queue [ms]."""
+        """Time in the queue, and waiting for data of the mesh [ms]."""
         return (self.start_ns - self.ready_ns) / 1e6
 
     @property
@@ -58,11 +62,17 @@ class Vertex:
     """In port → name of the datum."""
     outputs: Mapping[str, str]
     """Out port → name of the datum."""
+    config: Any = None
+    """What its processor is initialised with, again when a component that was stopped starts."""
+    deadline_ns: int | None = None
+    """From when its inputs are there to its end; what takes longer is counted [ns]."""
+    expendable: bool = False
+    """Whether it is left out in a frame past its deadline, where the component degrades such frames."""
     successors: list[Vertex] = field(default_factory=list)
     predecessors: int = 0
     queue: deque[Run] = field(default_factory=deque)
     """Frames that it has not started, in the order of versions."""
-    busy: bool = False
+    running: Run | None = None
 
 
 @dataclass(eq=False, slots=True)
@@ -78,6 +88,7 @@ class Run:
     remaining: int = 0
     error: BaseException | None = None
     failed_vertex: str = ""
+    deadline: FrameDeadline | None = None
 
 
 class GraphEngine:
@@ -107,8 +118,11 @@ class GraphEngine:
         self._vertices = vertices
         self._worker_count = workers
         self._on_timing = on_timing
-        self._ready: deque[tuple[Vertex, Run]] = deque()
-        self._changed = threading.Condition()
+        self._ready: deque[tuple[Vertex, Run, bool]] = deque()
+        self._lock = threading.Lock()
+        # A queue in C wakes its thread in half the time that a condition does.
+        self._wakes: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._sleepers = 0
         self._stopping = False
         self._threads: list[threading.Thread] = []
         producers = {datum: vertex for vertex in vertices for datum in vertex.outputs.values()}
@@ -119,60 +133,121 @@ class GraphEngine:
                 source.successors.append(vertex)
 
     def start(self) -> None:
-        """Starts the workers."""
+        """Starts the workers.
+
+        Raises:
+            RuntimeError: A worker from before the last stop still hangs in a processor.
+        """
+        hanging = self.running()
+        if hanging:
+            raise RuntimeError(f"{self.name} cannot start again: {hanging} still runs since the last stop")
+        self._stopping = False
         for number in range(self._worker_count):
             thread = threading.Thread(target=self._work, name=f"{self.name}-worker-{number}", daemon=True)
             self._threads.append(thread)
             thread.start()
 
-    def stop(self) -> None:
-        """Lets the running vertices finish, drops what is queued, and joins the workers."""
-        with self._changed:
-            self._stopping = True
-            self._changed.notify_all()
-        for thread in self._threads:
-            thread.join()
-        self._threads.clear()
+    def stop(self, timeout: float | None = None) -> bool:
+        """Lets the running vertices finish, drops what is queued, and joins the workers.
 
-    def submit(self, trigger: Trigger, data: dict[str, Any], on_done: Callable[[Run], None]) -> None:
+        Args:
+            timeout: How long running vertices may take [s]; None is for ever.
+
+        Returns:
+            Whether they all finished. Workers that did not are left to themselves.
+        """
+        with self._lock:
+            self._stopping = True
+            self._ready.clear()
+            sleepers, self._sleepers = self._sleepers, 0
+        for _ in range(sleepers):
+            self._wakes.put(None)
+        until = None if timeout is None else time.monotonic() + timeout
+        for thread in self._threads:
+            thread.join(None if until is None else max(0.0, until - time.monotonic()))
+        finished = not any(thread.is_alive() for thread in self._threads)
+        self._threads.clear()
+        if finished:
+            for vertex in self._vertices:
+                vertex.queue.clear()
+                vertex.running = None
+        return finished
+
+    def running(self) -> dict[str, int]:
+        """The vertices that are at work, and the versions that they are at work on."""
+        with self._lock:
+            return {v.name: v.running.trigger.version for v in self._vertices if v.running is not None}
+
+    def submit(
+        self,
+        trigger: Trigger,
+        data: dict[str, Any],
+        on_done: Callable[[Run], None],
+        deadline: FrameDeadline | None = None,
+        *,
+        serves: bool = False,
+    ) -> None:
         """Starts a frame. Frames must be submitted in the order of versions.
 
         Args:
             trigger: Of the frame.
             data: The component's inputs by name; those that are missing are absent.
             on_done: Called in a worker's thread when every vertex has run or was skipped.
+            deadline: By which the frame is to be done; what has not started by then may be left out.
+            serves: The caller serves the graph next, so one worker fewer is woken.
         """
-        run = Run(trigger, data, on_done, remaining=len(self._vertices))
+        vertices = self._vertices
+        run = Run(trigger, data, on_done, remaining=len(vertices), deadline=deadline)
         now = time.perf_counter_ns()
-        with self._changed:
-            for vertex in self._vertices:
+        ready = 0
+        with self._lock:
+            for vertex in vertices:
                 run.waiting[vertex] = vertex.predecessors
                 vertex.queue.append(run)
-            for vertex in self._vertices:
                 if vertex.predecessors == 0:
                     run.ready_ns[vertex] = now
-                    self._changed.notify(self._offer(vertex))
+                    ready += self._offer(vertex)
+            wakes = self._claim(ready - serves)
+        for _ in range(wakes):
+            self._wakes.put(None)
 
     def _offer(self, vertex: Vertex) -> int:
         """Makes the vertex's next frame ready to run if both are; gives how many it made. Called with the lock held."""
-        if vertex.busy or not vertex.queue or vertex.queue[0].waiting[vertex] > 0:
+        if vertex.running is not None or not vertex.queue or vertex.queue[0].waiting[vertex] > 0:
             return 0
-        vertex.busy = True
-        self._ready.append((vertex, vertex.queue.popleft()))
+        vertex.running = run = vertex.queue.popleft()
+        self._ready.append((vertex, run, False))
         return 1
+
+    def _claim(self, ready: int) -> int:
+        """How many sleeping workers to wake for so many ready vertices. Called with the lock held."""
+        wakes = min(ready, self._sleepers) if ready > 0 else 0
+        self._sleepers -= wakes
+        return wakes
 
     def _work(self) -> None:
         while True:
-            with self._changed:
-                while not self._ready and not self._stopping:
-                    self._changed.wait()
+            with self._lock:
                 if self._stopping:
                     return
-                vertex, run = self._ready.popleft()
-            self._execute(vertex, run)
+                sleeps = not self._ready
+                self._sleepers += sleeps
+            if sleeps:
+                self._wakes.get()
+            self.serve()
+
+    def serve(self) -> None:
+        """Runs what is ready, in the calling thread, until nothing is."""
+        while True:
+            with self._lock:
+                if not self._ready:
+                    return
+                vertex, run, resumed = self._ready.popleft()
+            if not self._execute(vertex, run, resumed):
+                continue
             now = time.perf_counter_ns()
-            with self._changed:
-                vertex.busy = False
+            with self._lock:
+                vertex.running = None
                 run.remaining -= 1
                 done = run.remaining == 0
                 ready = 0
@@ -182,11 +257,23 @@ class GraphEngine:
                         run.ready_ns[successor] = now
                         ready += self._offer(successor)
                 ready += self._offer(vertex)
-                # One is for this worker, without a change of threads, unless it has a frame to hand over first.
-                self._changed.notify(ready if done else max(0, ready - 1))
+                # One is for this thread, without a change of threads, unless it has a frame to hand over first.
+                wakes = self._claim(ready if done else ready - 1)
+            for _ in range(wakes):
+                self._wakes.put(None)
             if done:
                 self._tell(run.on_done, run)
             del vertex, run  # a worker that waits must not keep a frame alive
+
+    def _resume(self, vertex: Vertex, run: Run) -> None:
+        """Makes a vertex that waited ready to run."""
+        with self._lock:
+            if self._stopping:
+                return
+            self._ready.append((vertex, run, True))
+            wakes = self._claim(1)
+        if wakes:
+            self._wakes.put(None)
 
     def _tell(self, callback: Callable[[Any], None], event: Any) -> None:
         """Calls back; a worker outlives whatever it calls, or the frames behind it would never end."""
@@ -195,23 +282,20 @@ class GraphEngine:
         except Exception:
             _log.exception("%s: a callback failed", self.name)
 
-    def _execute(self, vertex: Vertex, run: Run) -> None:
+    def _execute(self, vertex: Vertex, run: Run, resumed: bool) -> bool:
+        """Runs a vertex for a frame; False where it waits, and goes on later."""
         processor = vertex.processor
         start = time.perf_counter_ns()
-        runnable = True
-        for name, datum in vertex.inputs.items():
-            port = processor.ports[name]
-            if datum in run.data:
-                port.value = run.data[datum]
-            else:
-                port.clear()
-                runnable = runnable and port.optional
-        for name in vertex.outputs:
-            processor.ports[name].clear()
-        if not runnable:
+        if run.deadline is not None and run.deadline.leaves_out(vertex.expendable):
+            status = Status.CUT
+        elif not resumed and not self._fill(vertex, run):
             status = Status.SKIPPED
         else:
             try:
+                if processor.waits and not resumed:
+                    if processor.begin(run.trigger, lambda: self._resume(vertex, run)):
+                        return False
+                    start = time.perf_counter_ns()
                 status = processor.process(run.trigger)
                 if not isinstance(status, Status):
                     raise TypeError(f"process of {type(processor).__name__} returned {status!r}, not a Status")
@@ -225,8 +309,27 @@ class GraphEngine:
                         run.data[datum] = processor.ports[name].value
         for port in processor.ports.values():
             port.clear()
+        end, ready = time.perf_counter_ns(), run.ready_ns.get(vertex, start)
+        late = vertex.deadline_ns is not None and end - ready > vertex.deadline_ns
+        if late:
+            processor.losses.count(processor.place, "deadline", run.trigger.version)
         if self._on_timing is not None:
-            ready = run.ready_ns.get(vertex, start)
-            version = run.trigger.version
-            timing = VertexTiming(self.name, vertex.name, version, ready, start, time.perf_counter_ns(), status)
+            version, epoch = run.trigger.version, run.trigger.epoch
+            timing = VertexTiming(self.name, vertex.name, version, ready, start, end, status, late, epoch)
             self._tell(self._on_timing, timing)
+        return True
+
+    def _fill(self, vertex: Vertex, run: Run) -> bool:
+        """Gives a vertex its inputs; tells whether all that it needs are there."""
+        processor = vertex.processor
+        runnable = True
+        for name, datum in vertex.inputs.items():
+            port = processor.ports[name]
+            if datum in run.data:
+                port.value = run.data[datum]
+            else:
+                port.clear()
+                runnable = runnable and port.optional
+        for name in vertex.outputs:
+            processor.ports[name].clear()
+        return runnable

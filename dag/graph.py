@@ -73,11 +73,12 @@ def _check_inputs(
     """Every datum that is read comes from the trigger or another vertex, with a fitting type."""
     for name, vertex in vertices.items():
         for port, datum in vertex.inputs.items():
-            if datum in component.inputs and datum != component.trigger:
+            if datum in component.inputs and datum not in component.trigger.inputs:
+                triggers = ", ".join(component.trigger.inputs) or "of time"
                 raise file.error(
                     [*keys, "graph", name, "in", port],
-                    f"input {datum!r} is not the trigger {component.trigger!r}, whose data alone the graph is given: "
-                    "a processor reads it through `component_inputs`",
+                    f"input {datum!r} is not among the triggers {triggers}, whose "
+                    "data alone the graph is given: read it by GetRecentDagProcessor or AlignDagProcessor",
                 )
             if datum not in producers:
                 if vertex.processor.ports[port].optional:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import sys
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from ..datamesh import DataMesh
 from ..errors import ConfigError
@@ -13,6 +15,7 @@ from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
 from .configuration import ConfigFile, import_class, nearest
 from .engine import VertexTiming
+from .flags import load_flags
 from .graph import DeclaredVertex, check_payloads, declare_vertices, graph_payloads, type_name
 from .schema import ComponentSpec, ModuleSpec
 
@@ -79,6 +82,8 @@ class Process:
         external: Mapping[str, Any] | None = None,
         offline: bool = False,
         on_timing: Callable[[VertexTiming], None] | None = None,
+        check: bool = False,
+        switch_interval_s: float | None = 100e-6,
     ) -> None:
         """Builds, checks and initialises all components.
 
@@ -87,15 +92,21 @@ class Process:
             mesh: Where their topics live; by default a mesh of its own.
             context: Given to every component and processor as `self.context`.
             external: Topics that are committed from outside the modules, with their payload types.
-            offline: Every backlog blocks its producer, so that no frame is lost to a slow component.
+            offline: Every backlog blocks its producer, so that no frame is lost to a slow component; deadlines are
+                counted and change nothing.
             on_timing: Is told of the run of every vertex.
+            check: Payloads are compared with what they were at their commit; see `DataMesh`.
+            switch_interval_s: How long a thread that computes in Python keeps others waiting, while this process runs
+                (`sys.setswitchinterval`); None leaves it as it is. Python's own 5 ms are as much as a frame's share.
 
         Raises:
             ConfigError: A module does not fit its classes or the others.
         """
-        self.mesh = mesh if mesh is not None else DataMesh()
+        self.mesh = mesh if mesh is not None else DataMesh(check=check)
+        self.flags = load_flags(modules)
         self.components: dict[str, Component] = {}
         self._started: list[Component] = []
+        self._switching = _SwitchInterval(switch_interval_s)
         places = [(file, index) for file in modules for index in range(len(file.content.components))]
         built = [self._declare(place, context) for place in places]
         self._check_topics(places, external or {})
@@ -132,10 +143,17 @@ class Process:
                 for name, handle in handles.items():
                     handle.payload = payloads.get(name, object) if handle.payload is object else handle.payload
             for declared in vertices:
-                declared.vertex.processor.context = context
-                declared.vertex.processor.in_flight = spec.in_flight
-                declared.vertex.processor.component_inputs = component.inputs
-                declared.vertex.processor.component_outputs = component.outputs
+                vertex, vertex_spec = declared.vertex, spec.graph[declared.vertex.name]
+                vertex.config = declared.config
+                vertex.expendable = vertex_spec.expendable
+                if vertex_spec.deadline_ms is not None:
+                    vertex.deadline_ns = round(vertex_spec.deadline_ms * 1e6)
+                processor = vertex.processor
+                processor.context = context
+                processor.flags = self.flags
+                processor.in_flight = spec.in_flight
+                processor.component_inputs = component.inputs
+                processor.component_outputs = component.outputs
         for direction, handles, topics in (
             ("inputs", component.inputs, spec.inputs),
             ("outputs", component.outputs, spec.outputs),
@@ -146,6 +164,7 @@ class Process:
             for name, handle in handles.items():
                 if name not in topics and not handle.optional:
                     raise file.error(keys, f"{direction}.{name} is not mapped to a topic")
+        component.flags = self.flags
         self.components[spec.name] = component
         return component, vertices
 
@@ -215,11 +234,13 @@ class Process:
         """No component waits for a trigger that only comes of its own outputs."""
         specs = [(file, index, file.content.components[index]) for file, index in places]
         producers = {topic: spec for _, _, spec in specs for topic in spec.outputs.values()}
+        needs = {
+            spec.name: [producers[t].name for t in map(spec.inputs.get, spec.trigger.inputs) if t in producers]
+            for _, _, spec in specs
+        }
         for file, index, spec in specs:
-            chain, at = [spec.name], spec
-            while (at := producers.get(at.inputs.get(at.trigger, ""))) is not None and at.name not in chain:
-                chain.append(at.name)
-            if at is spec:
+            chain = _path(needs, spec.name, spec.name)
+            if chain:
                 message = f"these components trigger each other in a cycle, so none ever runs: {chain}"
                 raise file.error(["components", index, "trigger"], message)
 
@@ -249,11 +270,15 @@ class Process:
             except (ValueError, TypeError, KeyError) as error:
                 raise file.error([*keys, "graph", vertex.name, "config"], str(error)) from error
         if isinstance(component, DagComponent):
+            deadline = spec.deadline
+            if offline and deadline is not None:
+                deadline = deadline.model_copy(update={"on_miss": "count"})
             component.set_graph(
                 [declared.vertex for declared in vertices],
                 workers=spec.workers,
                 in_flight=spec.in_flight,
                 on_timing=on_timing,
+                deadline=deadline,
             )
         if not isinstance(component, GenericComponent):
             config = file.validate([*keys, "config"], component.Config, spec.config)
@@ -263,14 +288,14 @@ class Process:
                 raise file.error([*keys, "config"], str(error)) from error
         if isinstance(component, DataProcessComponent):
             backlog = BacklogConfig(policy="block", depth=spec.backlog.depth) if offline else spec.backlog
-            window = component.inputs[spec.trigger].window
-            if backlog.policy != "latest" and backlog.depth + 2 > window.capacity:
-                raise file.error(
-                    [*keys, "backlog", "depth"],
-                    f"{backlog.depth} triggers may wait, but the window of {window.topic!r} keeps {window.capacity} "
-                    f"versions, so they would be evicted; at most {window.capacity - 2}",
-                )
-            component.set_trigger(spec.trigger, backlog)
+            for window in (component.inputs[name].window for name in spec.trigger.inputs):
+                if backlog.policy != "latest" and backlog.depth + 2 > window.capacity:
+                    raise file.error(
+                        [*keys, "backlog", "depth"],
+                        f"{backlog.depth} triggers may wait, but the window of {window.topic!r} keeps "
+                        f"{window.capacity} versions, so they would be evicted; at most {window.capacity - 2}",
+                    )
+            component.set_trigger(spec.trigger, backlog, spec.hand_off)
 
     @property
     def in_flight(self) -> int:
@@ -278,7 +303,8 @@ class Process:
         return max((c.in_flight for c in self.components.values() if isinstance(c, DagComponent)), default=1)
 
     def start(self) -> None:
-        """Starts the components, those that consume before those that produce; all of them, or none."""
+        """Starts the components, those that consume before those that produce; all of them, or none. And again."""
+        self._switching.hold()
         for component in self._consumers_first():
             try:
                 component.start()
@@ -295,6 +321,7 @@ class Process:
                 component.stop()
             except Exception:  # the others must stop all the same
                 _log.exception("%s failed to stop", component.name)
+        self._switching.release()
 
     def _consumers_first(self) -> Iterable[Component]:
         order: list[Component] = []
@@ -314,5 +341,47 @@ def _feeds(component: Component, others: Iterable[Component]) -> bool:
 
 def _triggers(component: Component, others: Iterable[Component]) -> bool:
     topics = {handle.topic for handle in component.outputs.values()}
-    triggered = (one for one in others if isinstance(one, DataProcessComponent) and one.trigger_input is not None)
-    return any(one.inputs[one.trigger_input or ""].topic in topics for one in triggered)
+    triggered = (one for one in others if isinstance(one, DataProcessComponent))
+    return any(one.inputs[name].topic in topics for one in triggered for name in one.trigger_inputs)
+
+
+def _path(needs: Mapping[str, Sequence[str]], start: str, end: str, seen: frozenset[str] = frozenset()) -> list[str]:
+    """The names from one to another that it needs, directly or not, without the last; empty where there is no way."""
+    for name in needs[start]:
+        if name == end:
+            return [start]
+        way = _path(needs, name, end, seen | {start}) if name not in seen else []
+        if way:
+            return [start, *way]
+    return []
+
+
+class _SwitchInterval:
+    """Python's switch interval, shortened while one of the processes that ask for it runs."""
+
+    _lock: ClassVar[threading.Lock] = threading.Lock()
+    _held: ClassVar[list[float]] = []
+    _before: ClassVar[float] = 0.0
+
+    def __init__(self, seconds: float | None) -> None:
+        self._seconds = seconds
+        self._holds = False
+
+    def hold(self) -> None:
+        """Shortens it, for the first one that holds it."""
+        with self._lock:
+            if self._seconds is None or self._holds:
+                return
+            if not self._held:
+                _SwitchInterval._before = sys.getswitchinterval()
+            self._held.append(self._seconds)
+            self._holds = True
+            sys.setswitchinterval(min(self._before, *self._held))
+
+    def release(self) -> None:
+        """Sets it to what the others ask for, or what it was."""
+        with self._lock:
+            if self._seconds is not None and self._holds:
+                self._held.remove(self._seconds)
+                self._holds = False
+                sys.setswitchinterval(min([self._before, *self._held]))

@@ -11,7 +11,8 @@ class NearestObject(Processor):
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict
@@ -101,6 +102,8 @@ class Processor:
 
     Config: ClassVar[type[BaseModel]] = ProcessorConfig
     """The model of its configuration; a subclass names its own."""
+    waits: ClassVar[bool] = False
+    """Whether it may have to wait for data of the mesh, so that `begin` is called before `process`."""
 
     def __init__(self) -> None:
         self.name = type(self).__name__
@@ -110,6 +113,8 @@ class Processor:
         self.place = self.name
         """Where losses are counted: component.vertex."""
         self.losses = LossCounters()
+        self.flags: Mapping[str, Any] = {}
+        """What the flag loaders of the process found."""
         self.component_inputs: Mapping[str, Input] = {}
         self.component_outputs: Mapping[str, Output] = {}
         self.ports = declared_ports(type(self))
@@ -118,6 +123,18 @@ class Processor:
 
     def init(self, config: Any) -> None:
         """Prepares for the first run: builds plans, loads models. `config` is an instance of `Config`."""
+
+    def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
+        """Begins to wait, where `waits` is set, and gives the worker back meanwhile.
+
+        Args:
+            trigger: Of the frame.
+            resume: To be called once, from any thread, when the wait is over; `process` runs then.
+
+        Returns:
+            Whether it waits. If not, `process` runs at once, and `resume` is not called.
+        """
+        return False
 
     def process(self, trigger: Trigger) -> Status:
         """Runs for one frame: reads its In ports, writes its Out ports.
@@ -136,16 +153,28 @@ class ProcessorHarness:
     outputs = ProcessorHarness(MyProcessor, {"radius": 0.5}).feed(cloud=cloud).run(version=0)
     """
 
-    def __init__(self, processor: type[Processor], config: Mapping[str, Any] | None = None, context: Any = None):
+    def __init__(
+        self,
+        processor: type[Processor],
+        config: Mapping[str, Any] | None = None,
+        context: Any = None,
+        *,
+        inputs: Mapping[str, Input] | None = None,
+        outputs: Mapping[str, Output] | None = None,
+    ):
         """Makes and initialises the processor.
 
         Args:
             processor: Its class.
             config: Its configuration, validated by the class's `Config`.
             context: What the runtime would give as `self.context`.
+            inputs: The component's inputs, bound, for a processor that reads the mesh.
+            outputs: The component's outputs, bound, for a processor that commits to the mesh.
         """
         self.processor = processor()
         self.processor.context = context
+        self.processor.component_inputs = inputs or {}
+        self.processor.component_outputs = outputs or {}
         self.processor.init(processor.Config.model_validate(dict(config or {})))
         self.status: Status | None = None
 
@@ -163,10 +192,19 @@ class ProcessorHarness:
             port.value = value
         return self
 
-    def run(self, version: int = 0) -> dict[str, Any]:
-        """Runs once and gives the Out ports that were written, by name; `.status` tells how it ended."""
+    def run(self, version: int | Trigger = 0) -> dict[str, Any]:
+        """Runs once and gives the Out ports that were written, by name; `.status` tells how it ended.
+
+        Args:
+            version: Of the frame [ns], or the whole trigger.
+        """
         outputs = {name: port for name, port in self.processor.ports.items() if isinstance(port, Out)}
         for port in outputs.values():
             port.clear()
-        self.status = self.processor.process(Trigger(version))
+        trigger = version if isinstance(version, Trigger) else Trigger(version)
+        if self.processor.waits:
+            resumed = threading.Event()
+            if self.processor.begin(trigger, resumed.set):
+                resumed.wait()
+        self.status = self.processor.process(trigger)
         return {name: port.value for name, port in outputs.items() if port.present}

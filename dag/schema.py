@@ -8,8 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 
 from .backlog import BacklogConfig
 from .configuration import nearest
+from .deadline import DeadlineConfig
+from .trigger import TriggerConfig
 
-__all__ = ["ComponentSpec", "ModuleSpec", "VertexSpec"]
+__all__ = ["ComponentSpec", "FlagLoaderSpec", "ModuleSpec", "VertexSpec"]
 
 
 class _Spec(BaseModel):
@@ -27,6 +29,10 @@ class VertexSpec(_Spec):
     """In port → name of the datum; a port that is left out takes the datum of its own name."""
     outputs: dict[str, str] = Field(default={}, alias="out")
     """Out port → name of the datum; a port that is left out gives the datum of its own name."""
+    deadline_ms: float | None = Field(None, gt=0.0)
+    """From when its inputs are there to its end; what takes longer is counted [ms]."""
+    expendable: bool = False
+    """Whether it is left out in a frame past the component's deadline, with `on_miss: degrade`."""
 
 
 class ComponentSpec(_Spec):
@@ -43,8 +49,12 @@ class ComponentSpec(_Spec):
     """Input → topic."""
     outputs: dict[str, str] = {}
     """Output → topic."""
-    trigger: str = Field("", validate_default=True)
-    """The input whose commits start a run."""
+    trigger: TriggerConfig = Field(TriggerConfig(), validate_default=True)
+    """What starts a run: an input whose commits do, or `any`, `all` or `period_ms`."""
+    hand_off: Literal["thread", "inline"] = "thread"
+    """Who runs it: threads of its own, or inline the thread that commits what triggers it."""
+    deadline: DeadlineConfig | None = None
+    """By when a dag is to be done with a frame."""
     backlog: BacklogConfig = BacklogConfig(policy="latest", depth=1, drop="oldest")
     workers: int = Field(1, ge=1, le=64)
     """Threads of a dag."""
@@ -55,10 +65,12 @@ class ComponentSpec(_Spec):
 
     @field_validator("trigger")
     @classmethod
-    def _is_an_input(cls, trigger: str, info: ValidationInfo) -> str:
+    def _is_an_input(cls, trigger: TriggerConfig, info: ValidationInfo) -> TriggerConfig:
         inputs = info.data.get("inputs")
-        if inputs is not None and info.data.get("kind", "generic") != "generic" and trigger not in inputs:
-            raise ValueError(f"the trigger must be one of the inputs, not {trigger!r}; {nearest(trigger, inputs)}")
+        if inputs is not None and info.data.get("kind", "generic") != "generic" and trigger.period_ms is None:
+            for name in trigger.inputs or ("",):
+                if name not in inputs:
+                    raise ValueError(f"the trigger must be one of the inputs, not {name!r}; {nearest(name, inputs)}")
         return trigger
 
     @model_validator(mode="after")
@@ -68,9 +80,20 @@ class ComponentSpec(_Spec):
             raise ValueError(f"a component of kind {self.kind} needs a graph")
         if not dag and self.graph:
             raise ValueError(f"a component of kind {self.kind} has no graph: make it dag or monotonic_dag")
+        if not dag and self.deadline is not None:
+            raise ValueError(f"a component of kind {self.kind} has no deadline: make it dag or monotonic_dag")
         if not dag and not self.class_name:
             raise ValueError(f"a component of kind {self.kind} needs a class")
         return self
+
+
+class FlagLoaderSpec(_Spec):
+    """Something that runs before everything else, and says what the components can look up."""
+
+    class_name: str = Field(alias="class")
+    """Dotted name of a class with a method `load() -> Mapping[str, Any]`."""
+    config: dict[str, Any] = {}
+    """Arguments for its constructor."""
 
 
 class ModuleSpec(_Spec):
@@ -79,4 +102,6 @@ class ModuleSpec(_Spec):
     module: str
     """Its name."""
     description: str = ""
+    flag_loaders: list[FlagLoaderSpec] = []
+    """Run first, in their order; what they load, the components see as `self.flags`."""
     components: list[ComponentSpec]

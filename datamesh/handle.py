@@ -166,6 +166,11 @@ class _Handle(Generic[T]):
         self._window = window
 
     @property
+    def is_bound(self) -> bool:
+        """Whether it is connected to a topic."""
+        return self._window is not None
+
+    @property
     def window(self) -> Window[T]:
         """The window of the topic.
 

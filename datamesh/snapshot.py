@@ -49,6 +49,16 @@ class Entry(NamedTuple, Generic[T]):
     checksum: int | None = None
     """Of the payload at its commit, in a mesh that checks."""
 
+    def read(self, stream: Any = None) -> T:
+        """The value, once it is written: `stream` waits for that if the reader named one, else the calling thread."""
+        completion = self.completion
+        if completion is not None:
+            if stream is None:
+                completion.synchronize()
+            elif stream is not completion.stream:
+                completion.wait_on(stream)
+        return self.value
+
 
 class State(Generic[T]):
     """What a window holds at one moment, in one epoch. What snapshots read of it never changes."""
@@ -124,19 +134,10 @@ class Snapshot(Generic[T]):
         Raises:
             IndexError: There is none; −1 is what the searches give on a miss, and never the newest.
         """
-        return self._read(self.entry(index))
+        return self.entry(index).read(self._stream)
 
     def __iter__(self) -> Iterator[T]:
-        return (self._read(entry) for entry in self._state.entries)
-
-    def _read(self, entry: Entry[T]) -> T:
-        completion = entry.completion
-        if completion is not None:
-            if self._stream is None:
-                completion.synchronize()
-            elif self._stream is not completion.stream:
-                completion.wait_on(self._stream)
-        return entry.value
+        return (entry.read(self._stream) for entry in self._state.entries)
 
     def entry(self, index: int) -> Entry[T]:
         """The datum at an index, with its version and times; a device may still be writing it.
@@ -175,7 +176,7 @@ class Snapshot(Generic[T]):
         """
         if not self._state.entries:
             raise LookupError("the window is empty: nothing was committed yet")
-        return self._read(self._state.entries[-1])
+        return self._state.entries[-1].read(self._stream)
 
     def before(self, version: int) -> int:
         """The index of the newest version < `version`, or −1."""

@@ -130,7 +130,8 @@ class Window(Generic[T]):
 
         Args:
             policy: What to do where it is older than the newest. An epoch older than the window's is out of order under
-                every policy; a newer one takes the window into it.
+                every policy but FORCE_NEW_EPOCH, with which the topic has epochs of its own; a newer one takes the
+                window into it.
             entry: The datum.
             equal: What to do where there is one of its version.
             triggers: Whether it starts runs; by default if it becomes the newest.
@@ -152,7 +153,9 @@ class Window(Generic[T]):
         """Commits at once. Called with the commit lock held."""
         with self._lock:
             state = self._state
-            if entry.epoch == CURRENT_EPOCH:
+            if entry.epoch == CURRENT_EPOCH or (
+                policy is CommitPolicy.FORCE_NEW_EPOCH and entry.epoch < state.epoch
+            ):
                 entry = entry._replace(epoch=state.epoch)
             if entry.epoch > state.epoch:
                 state = self._stepped(entry.epoch)

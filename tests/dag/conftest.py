@@ -16,7 +16,7 @@ class Topic:
         from warploom.datamesh import Output
 
         self.window = window
-        self.entries, self.settled, self.events = {}, [], []
+        self.entries, self.settled, self.events, self.orders = {}, [], [], []
         self._changed = threading.Condition()
         self._output = Output()
         self._output.bind("test", window)
@@ -26,24 +26,35 @@ class Topic:
         with self._changed:
             self.entries[entry.version] = entry.value
             self.events.append(entry.version)
+            self.orders.append((entry.epoch, entry.version))
             self._changed.notify_all()
 
     def _on_settle(self, version, epoch):
         with self._changed:
             self.settled.append(version)
             self.events.append(version)
+            self.orders.append((epoch, version))
             self._changed.notify_all()
 
-    def commit(self, version, value=None, policy=None):
+    def commit(self, version, value=None, policy=None, **options):
         from warploom.datamesh import CommitPolicy
 
         with self._output.allocate_change() as change:
             change.set_version(version)
             change.value = value
-            return self._output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER if policy is None else policy, change)
+            policy = CommitPolicy.DISCARD_OUT_OF_ORDER if policy is None else policy
+            return self._output.commit(policy, change, **options)
 
     def settle(self, version):
         self._output.settle(version)
+
+    def new_epoch(self):
+        self._output.new_epoch()
+
+    def wait_for_orders(self, *orders):
+        """Waits until each (epoch, version) was committed or settled."""
+        with self._changed:
+            return self._changed.wait_for(lambda: set(orders) <= set(self.orders), 20)
 
     def wait_for(self, *versions):
         """Waits until each version was committed or settled."""

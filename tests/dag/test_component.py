@@ -15,7 +15,7 @@ from warploom.dag import (
     Trigger,
     Vertex,
 )
-from warploom.datamesh import CommitPolicy, DataMesh, Miss, Status
+from warploom.datamesh import CommitPolicy, DataMesh, EqualVersion, Miss, Status
 
 WAIT = 20.0
 FIFO, BLOCK = BacklogConfig(policy="fifo", depth=30), BacklogConfig(policy="block")
@@ -257,21 +257,56 @@ def test_a_monotonic_graph_has_one_frame_at_a_time_whatever_is_configured(topic,
 
 
 def test_a_monotonic_graph_drops_what_is_not_newer_than_the_last_started(topic, started, caplog):
-    """Also when the last one failed. A new epoch lets older versions through the window."""
+    """Also when the last one failed."""
     mesh = DataMesh()
     ran = []
     given, result = topic(mesh.window("input")), topic(mesh.window("output"))
     act = failing_at(30)
     started(dag(mesh, lambda t, v: ran.append(t.version) or act(t, v), kind=MonotonicDagComponent))
-    for version in (10, 30):
-        given.commit(version)
-        result.wait_for(version)
-    mesh.window("input").new_epoch()
-    for version in (20, 30, 40):
-        given.commit(version)
+    for version, policy in ((10, None), (30, None), (20, CommitPolicy.OVERWRITE), (40, None)):
+        given.commit(version, policy=policy)
         result.wait_for(version)
     assert ran == [10, 30, 40]
-    assert mesh.losses.as_dict() == {"dag": {"out_of_order": 2}, "dag.v0": {"failed": 1}}
+    assert mesh.losses.as_dict() == {
+        "dag": {"out_of_order": 1},
+        "dag.v0": {"failed": 1},
+        "input": {"overwritten": 1},
+    }
+
+
+def test_a_new_epoch_takes_a_whole_chain_back_to_lower_versions(topic, started):
+    """Also those that keep order: a recording that loops is run again, and nothing of the first pass is lost."""
+    mesh = DataMesh()
+    first = dag(mesh, same, name="first", topics=("a", "b"), backlog=BLOCK, in_flight=2)
+    second = doubler(mesh, name="second", topics=("b", "c"), backlog=BLOCK)
+    third = dag(mesh, same, same, name="third", topics=("c", "d"), kind=MonotonicDagComponent, backlog=BLOCK)
+    a, d = topic(mesh.window("a")), topic(mesh.window("d"))
+    started(first, second, third)
+    for _ in range(3):
+        for version in range(20):
+            a.commit(version, version)
+        a.new_epoch()
+    assert d.wait_for_orders((2, 19))
+    assert d.orders == [(epoch, version) for epoch in range(3) for version in range(20)]
+    assert mesh.losses.as_dict() == {}
+
+
+def test_a_version_that_comes_again_does_not_run_again(topic, started):
+    """Replaced, inserted after all, or in the settled: once per component and version."""
+    mesh = DataMesh()
+    hold = Holding()
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    started(dag(mesh, hold))
+    for version in (10, 20, 30):
+        given.commit(version, version)
+    given.commit(20, "again", equal=EqualVersion.REPLACE)
+    given.commit(5, "late", CommitPolicy.INSERT_SORTED, triggers=True)
+    given.commit(30, "again", equal=EqualVersion.REPLACE)
+    given.commit(40, 40)
+    result.wait_for(5, 10, 20, 30, 40)
+    assert sorted(hold.started) == [5, 10, 20, 30, 40]
+    assert result.window.snapshot().versions == (10, 20, 30, 40)
+    assert mesh.losses.as_dict() == {"input": {"replaced": 2}, "output": {"out_of_order": 1}}
 
 
 def test_a_trigger_evicted_before_it_ran_is_counted_and_settled(topic, started):

@@ -87,7 +87,7 @@ def test_a_graph_knows_the_types_of_its_inputs_and_outputs(write):
          "graph.add: datum 'side' has two producers: this and the component's input of that name"),
         ("          total: sum", "          total: loud", 18,
          "describe.in.total: 'shout' gives str as 'loud', but input 'total' takes int"),
-        ("in: {value: number}", "in: {value: side}", 22, "add.in.value: input 'side' is not the trigger 'number'"),
+        ("in: {value: number}", "in: {value: side}", 22, "add.in.value: input 'side' is not among the triggers number"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_told_with_line_key_and_way_out(write, old, new, line, said):

@@ -47,7 +47,7 @@ def test_a_component_takes_sensible_defaults(write):
         ("kind: dag", "kind: data", 3, "components.0: a component of kind data has no graph"),
         ("kind: data", "kind: dag", 13, "components.1: a component of kind dag needs a graph"),
         ("    class: some.package.Map\n", "", 13, "components.1: a component of kind data needs a class"),
-        ("in: {cloud", "inn: {cloud", 11, "ground.inn: unknown key; did you mean 'in'? known: config, in, out"),
+        ("in: {cloud", "inn: {cloud", 11, "ground.inn: unknown key; did you mean 'in'? known: config, deadline_ms"),
         ("out: {mask: ground}", "out: [mask]", 12, "graph.ground.out: Input should be a valid dictionary"),
         ("processor: some.package.Ground", "processor: 5", 10, "ground.processor: Input should be a valid string"),
         ("class: some", "clas: some", 15, "components.1.clas: unknown key; did you mean 'class'?"),
