@@ -9,11 +9,13 @@ import warp as wp
 
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
-from ...kernels.ground import GroundSegment
+from ...kernels.backend import uses_taichi
+from ...kernels.ground import GroundSegment, segment_ground
 from ..execution import ExecutionContext, empty_cloud
+from .backends import Backend
 from .filtering import FilteredCloud
 
-__all__ = ["GroundProcessor", "GroundSurface"]
+__all__ = ["GroundConfig", "GroundProcessor", "GroundSurface"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,17 +30,33 @@ class GroundSurface:
     """Of the LiDAR above the ground near it [m]."""
 
 
+class GroundConfig(ProcessorConfig):
+    """How the ground is found."""
+
+    backend: Backend = "warp"
+    """What computes: warp, or taichi, taichi:cpu, taichi:vulkan, taichi:metal, taichi:cuda."""
+
+
 class GroundProcessor(Processor):
     """Tells the ground from what stands on it."""
 
+    Config = GroundConfig
     context: ExecutionContext
 
     filtered: In[FilteredCloud]
     ground: Out[GroundSurface]
 
-    def init(self, config: ProcessorConfig) -> None:
-        """Makes a plan for each frame in flight."""
+    def init(self, config: GroundConfig) -> None:
+        """Makes a plan for each frame in flight; Taichi keeps its own.
+
+        Raises:
+            DeviceError: Taichi cannot compute on its device.
+        """
         context = self.context
+        self._backend = config.backend
+        if uses_taichi(config.backend):
+            segment_ground(empty_cloud(context.device)[0], backend=config.backend)
+            return
         plans = [
             GroundSegment(capacity=context.capacity, sensor_height=context.mounting_height, device=context.device)
             for _ in range(self.in_flight)
@@ -49,6 +67,10 @@ class GroundProcessor(Processor):
     def process(self, trigger: Trigger) -> Status:
         """Segments one frame."""
         cloud = self.filtered.value
+        if self._backend != "warp":
+            found = segment_ground(cloud.xyz, sensor_height=self.context.mounting_height, backend=self._backend)
+            self.ground.value = GroundSurface(found.mask, found.height, found.sensor_height)
+            return Status.OK
         plan = next(self._plans)
         plan.launch(cloud.xyz, cloud.count)
         n = cloud.xyz.shape[0]

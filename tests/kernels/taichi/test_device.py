@@ -48,8 +48,15 @@ def test_a_second_device_is_refused(arch):
 
 
 def test_an_unknown_backend_is_refused(call, normal):
-    with pytest.raises(ValueError, match="backend must be 'warp' or 'taichi', not 'cuda'"):
+    with pytest.raises(ValueError, match=r"backend must be 'warp' or 'taichi' or .*, not 'cuda'"):
         call(normal(0, 10), backend="cuda")
+
+
+def test_a_backend_may_name_the_device(call, normal, arch):
+    call(normal(0, 10), backend=arch)
+    other = "taichi:metal" if arch != "taichi:metal" else "taichi:cpu"
+    with pytest.raises(DeviceError, match=f"here already on {arch!r}, so not on {other!r}"):
+        call(normal(0, 10), backend=other)
 
 
 def test_without_taichi_the_way_to_install_it_is_told(call, normal, monkeypatch):
