@@ -1,9 +1,5 @@
 """Overlap of oriented boxes: intersection over union from above and in space, all of one set with all of another.
 
-The common area of two rectangles is an integral along the edges of one in the frame of the other: by Green's
-theorem it is ∮ clamp(x, −a, a) dy over the parts of the edges with |y| ≤ b, for a rectangle of half sizes a, b at
-the origin. Nothing is clipped into lists of corners, so edges that coincide need no special case.
-
 Generalised intersection over union (Rezatofighi et al., 2019) also tells apart boxes that do not touch: it takes away
 the share of an enclosing body that neither fills.
 """
@@ -11,258 +7,219 @@ the share of an enclosing body that neither fills.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from .device import resolve_device
-from .interop import borrow, family_of, give
+from .box_overlap import SHAPE_ROWS, common_area, find_near, generalise_apart, hull_area, shape_boxes
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import adopt, borrow, family_of, give
 from .plan import capacity_for, plan_for
+from .threads import launch_parts, thread_count
 
-__all__ = ["GeneralizedIou", "RotatedIou", "bev_intersection", "giou_3d", "iou_3d", "rotated_iou_bev"]
+__all__ = ["GeneralizedIou", "RotatedIou", "giou_3d", "iou_3d", "rotated_iou_bev"]
+
+# What overlaps must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
 
 _ENCLOSINGS = ("hull", "box")
-_HULL = wp.constant(0)
-_Eight = wp.types.vector(length=8, dtype=wp.float32)
+_PAIRS_OF_PART = 10_000  # pairs for which a thread of their own is worth its while
+_A, _B, _Z, _H, _VOLUME = (wp.constant(row) for row in (2, 3, 6, 7, 9))
 
 
 @wp.func
-def _edge_integral(x0: float, y0: float, x1: float, y1: float, a: float, b: float) -> float:
-    """∫ clamp(x, −a, a) dy along an edge, over its part with |y| ≤ b."""
-    low = wp.clamp(y0, -b, b)
-    high = wp.clamp(y1, -b, b)
-    if low == high:
-        return 0.0
-    slope = (x1 - x0) / (y1 - y0)
-    # Between the ends, which rounding must not leave.
-    left = wp.clamp(x0 + (low - y0) * slope, wp.min(x0, x1), wp.max(x0, x1))
-    right = wp.clamp(x0 + (high - y0) * slope, wp.min(x0, x1), wp.max(x0, x1))
-    first = wp.min(left, right)
-    last = wp.max(left, right)
-    length = last - first
-    mean = wp.clamp(0.5 * (first + last), -a, a)
-    if length > 1.0e-6:
-        below = wp.max(wp.min(last, -a) - first, 0.0)
-        above = wp.max(last - wp.max(first, a), 0.0)
-        inner_first = wp.clamp(first, -a, a)
-        inner_last = wp.clamp(last, -a, a)
-        mean = (a * (above - below) + 0.5 * (inner_first + inner_last) * (inner_last - inner_first)) / length
-    return mean * (high - low)
+def _area(shapes: wp.array2d(dtype=wp.float32), i: int) -> float:
+    return 4.0 * shapes[_A, i] * shapes[_B, i]
 
 
 @wp.func
-def bev_intersection(
-    x0: float,
-    y0: float,
-    l0: float,
-    w0: float,
-    yaw0: float,
-    x1: float,
-    y1: float,
-    l1: float,
-    w1: float,
-    yaw1: float,
-) -> float:
-    """The area common to two rectangles [m²], each centre x y, length, width and yaw."""
-    dx = x1 - x0
-    dy = y1 - y0
-    reach = 0.5 * (wp.sqrt(l0 * l0 + w0 * w0) + wp.sqrt(l1 * l1 + w1 * w1))
-    # Written so that a NaN ends here too.
-    if not (dx * dx + dy * dy < reach * reach):
-        return 0.0
-    c = wp.cos(yaw0)
-    s = wp.sin(yaw0)
-    u = c * dx + s * dy
-    v = c * dy - s * dx
-    cr = wp.cos(yaw1 - yaw0)
-    sr = wp.sin(yaw1 - yaw0)
-    lx = 0.5 * l1 * cr
-    ly = 0.5 * l1 * sr
-    wx = -0.5 * w1 * sr
-    wy = 0.5 * w1 * cr
-    a = 0.5 * l0
-    b = 0.5 * w0
-    area = _edge_integral(u + lx - wx, v + ly - wy, u + lx + wx, v + ly + wy, a, b)
-    area += _edge_integral(u + lx + wx, v + ly + wy, u - lx + wx, v - ly + wy, a, b)
-    area += _edge_integral(u - lx + wx, v - ly + wy, u - lx - wx, v - ly - wy, a, b)
-    area += _edge_integral(u - lx - wx, v - ly - wy, u + lx - wx, v + ly - wy, a, b)
-    return wp.clamp(area, 0.0, wp.min(l0 * w0, l1 * w1))
+def _shared_height(shapes: wp.array2d(dtype=wp.float32), i: int, others: wp.array2d(dtype=wp.float32), j: int) -> float:
+    """Heights against the first box's, so that boxes far from z = 0 lose nothing."""
+    dz = others[_Z, j] - shapes[_Z, i]
+    top = wp.min(shapes[_H, i], dz + others[_H, j])
+    return top - wp.max(-shapes[_H, i], dz - others[_H, j])
+
+
+@wp.func
+def _overlap(shapes: wp.array2d(dtype=wp.float32), i: int, others: wp.array2d(dtype=wp.float32), j: int) -> wp.vec2:
+    """Intersection over union from above and in space."""
+    area = common_area(shapes, i, others, j)
+    bev = float(0.0)
+    space = float(0.0)
+    if area > 0.0:
+        bev = area / (_area(shapes, i) + _area(others, j) - area)
+        volume = area * _shared_height(shapes, i, others, j)
+        union = shapes[_VOLUME, i] + others[_VOLUME, j] - volume
+        if volume > 0.0 and union > 0.0:  # neither, if one has no volume
+            space = volume / union
+    return wp.vec2(bev, space)
 
 
 @wp.kernel
 def _iou_matrix(
     # in
-    boxes_in: wp.array2d(dtype=wp.float32),
+    shapes_in: wp.array2d(dtype=wp.float32),
     others_in: wp.array2d(dtype=wp.float32),
     counts_in: wp.array(dtype=wp.int32),
     # out
     bev_out: wp.array2d(dtype=wp.float32),
     space_out: wp.array2d(dtype=wp.float32),
 ):
-    """One pair a thread: intersection over union from above and in space."""
+    """One pair a thread."""
     i, j = wp.tid()  # pyright: ignore[reportAssignmentType]
     if i >= counts_in[0] or j >= counts_in[1]:
         return
-    l0 = boxes_in[i, 3]
-    w0 = boxes_in[i, 4]
-    h0 = boxes_in[i, 5]
-    l1 = others_in[j, 3]
-    w1 = others_in[j, 4]
-    h1 = others_in[j, 5]
-    area = bev_intersection(
-        boxes_in[i, 0],
-        boxes_in[i, 1],
-        l0,
-        w0,
-        boxes_in[i, 6],
-        others_in[j, 0],
-        others_in[j, 1],
-        l1,
-        w1,
-        others_in[j, 6],
-    )
-    bev = float(0.0)
-    space = float(0.0)
-    if area > 0.0:
-        bev = area / (l0 * w0 + l1 * w1 - area)
-        z0 = boxes_in[i, 2]
-        z1 = others_in[j, 2]
-        top = wp.min(z0 + 0.5 * h0, z1 + 0.5 * h1)
-        bottom = wp.max(z0 - 0.5 * h0, z1 - 0.5 * h1)
-        volume = area * wp.max(top - bottom, 0.0)
-        if volume > 0.0:
-            space = volume / (l0 * w0 * h0 + l1 * w1 * h1 - volume)
-    bev_out[i, j] = bev
-    space_out[i, j] = space
+    both = _overlap(shapes_in, i, others_in, j)
+    bev_out[i, j] = both[0]
+    space_out[i, j] = both[1]
+
+
+@wp.kernel
+def _iou_rows(
+    part: int,
+    parts: int,
+    # in
+    shapes_in: wp.array2d(dtype=wp.float32),
+    others_in: wp.array2d(dtype=wp.float32),
+    counts_in: wp.array(dtype=wp.int32),
+    rows: int,
+    columns: int,
+    is_clear: bool,
+    # in out: room for the boxes near one
+    near: wp.array2d(dtype=wp.int32),
+    # out: either may be missing
+    bev_out: wp.array2d(dtype=wp.float32),
+    space_out: wp.array2d(dtype=wp.float32),
+):
+    """Every so many rows; only pairs that may touch are looked at, the others are zero."""
+    last = wp.min(counts_in[1], columns)
+    for i in range(part, wp.min(counts_in[0], rows), parts):
+        if not is_clear:
+            for j in range(last):
+                if bev_out:
+                    bev_out[i, j] = 0.0
+                if space_out:
+                    space_out[i, j] = 0.0
+        for k in range(find_near(shapes_in, i, others_in, 0, last, near, part)):
+            j = near[part, k]
+            both = _overlap(shapes_in, i, others_in, j)
+            if bev_out:
+                bev_out[i, j] = both[0]
+            if space_out:
+                space_out[i, j] = both[1]
 
 
 @wp.func
-def _hull_area(x_in: _Eight, y_in: _Eight) -> float:
-    """The area of the convex hull of eight points: its upper chain less its lower one (Andrew, 1979)."""
-    x = _Eight(x_in)
-    y = _Eight(y_in)
-    for i in range(1, 8):
-        px = x[i]
-        py = y[i]
-        k = int(i)
-        while k > 0 and (x[wp.max(k - 1, 0)] > px or (x[wp.max(k - 1, 0)] == px and y[wp.max(k - 1, 0)] > py)):
-            x[k] = x[k - 1]
-            y[k] = y[k - 1]
-            k -= 1
-        x[k] = px
-        y[k] = py
-    area = float(0.0)
-    for chain in range(2):
-        sign = 1.0 - 2.0 * float(chain)
-        hx = _Eight()
-        hy = _Eight()
-        size = int(0)
-        for i in range(8):
-            turning = int(1)
-            while size > 1 and turning == 1:
-                ax = hx[size - 1] - hx[size - 2]
-                ay = hy[size - 1] - hy[size - 2]
-                bx = x[i] - hx[size - 2]
-                by = y[i] - hy[size - 2]
-                if sign * (ax * by - ay * bx) >= 0.0:
-                    size -= 1
-                else:
-                    turning = 0
-            hx[size] = x[i]
-            hy[size] = y[i]
-            size += 1
-        for i in range(1, size):
-            area += sign * 0.5 * (hy[i] + hy[i - 1]) * (hx[i] - hx[i - 1])
-    return area
-
-
-@wp.func
-def _enclosing_area(
-    x0: float,
-    y0: float,
-    l0: float,
-    w0: float,
-    yaw0: float,
-    x1: float,
-    y1: float,
-    l1: float,
-    w1: float,
-    yaw1: float,
-    enclosing: int,
+def _generalised(
+    shapes: wp.array2d(dtype=wp.float32),
+    i: int,
+    others: wp.array2d(dtype=wp.float32),
+    j: int,
+    area: float,
+    enclosing_area: float,
 ) -> float:
-    """The area of the convex hull of two rectangles, or of the rectangle along the first that holds both."""
-    c = wp.cos(yaw0)
-    s = wp.sin(yaw0)
-    u = c * (x1 - x0) + s * (y1 - y0)
-    v = c * (y1 - y0) - s * (x1 - x0)
-    cr = wp.cos(yaw1 - yaw0)
-    sr = wp.sin(yaw1 - yaw0)
-    lx = 0.5 * l1 * cr
-    ly = 0.5 * l1 * sr
-    wx = -0.5 * w1 * sr
-    wy = 0.5 * w1 * cr
-    a = 0.5 * l0
-    b = 0.5 * w0
-    if enclosing == _HULL:
-        x = _Eight(a, -a, -a, a, u + lx + wx, u - lx + wx, u - lx - wx, u + lx - wx)
-        y = _Eight(b, b, -b, -b, v + ly + wy, v - ly + wy, v - ly - wy, v + ly - wy)
-        return _hull_area(x, y)
-    reach_x = wp.abs(lx) + wp.abs(wx)
-    reach_y = wp.abs(ly) + wp.abs(wy)
-    length = wp.max(a, u + reach_x) - wp.min(-a, u - reach_x)
-    return length * (wp.max(b, v + reach_y) - wp.min(-b, v - reach_y))
-
-
-@wp.func
-def _has_volume(boxes: wp.array2d(dtype=wp.float32), i: int) -> bool:
-    total = float(0.0)
-    for column in range(7):
-        total += wp.abs(boxes[i, column])  # a sum, which is not finite if one of its terms is not
-    return wp.isfinite(total) and boxes[i, 3] > 0.0 and boxes[i, 4] > 0.0 and boxes[i, 5] > 0.0
+    """Generalised intersection over union, given the area shared and that which holds both; -1 without volumes."""
+    dz = others[_Z, j] - shapes[_Z, i]
+    low = wp.where(-shapes[_H, i] < dz - others[_H, j], -shapes[_H, i], dz - others[_H, j])
+    high = wp.where(shapes[_H, i] > dz + others[_H, j], shapes[_H, i], dz + others[_H, j])
+    volume = float(0.0)
+    if area > 0.0:
+        volume = area * wp.max(_shared_height(shapes, i, others, j), 0.0)
+    union = shapes[_VOLUME, i] + others[_VOLUME, j] - volume
+    # Rounding must not make the enclosing body smaller than what it holds.
+    body = enclosing_area * (high - low)
+    body = wp.where(body > union, body, union)
+    giou = volume / union - (body - union) / body
+    return wp.where(giou == giou, giou, -1.0)
 
 
 @wp.kernel
 def _giou_matrix(
     # in
-    boxes_in: wp.array2d(dtype=wp.float32),
+    shapes_in: wp.array2d(dtype=wp.float32),
     others_in: wp.array2d(dtype=wp.float32),
     counts_in: wp.array(dtype=wp.int32),
-    enclosing: int,
+    as_box: bool,
     # out
     giou_out: wp.array2d(dtype=wp.float32),
 ):
-    """One pair a thread: generalised intersection over union in space."""
+    """One pair a thread."""
     i, j = wp.tid()  # pyright: ignore[reportAssignmentType]
-    if i >= counts_in[0] or j >= counts_in[1]:
-        return
-    giou_out[i, j] = -1.0
-    if not (_has_volume(boxes_in, i) and _has_volume(others_in, j)):
-        return
-    x0 = boxes_in[i, 0]
-    y0 = boxes_in[i, 1]
-    z0 = boxes_in[i, 2]
-    l0 = boxes_in[i, 3]
-    w0 = boxes_in[i, 4]
-    h0 = boxes_in[i, 5]
-    yaw0 = boxes_in[i, 6]
-    x1 = others_in[j, 0]
-    y1 = others_in[j, 1]
-    z1 = others_in[j, 2]
-    l1 = others_in[j, 3]
-    w1 = others_in[j, 4]
-    h1 = others_in[j, 5]
-    yaw1 = others_in[j, 6]
-    area = bev_intersection(x0, y0, l0, w0, yaw0, x1, y1, l1, w1, yaw1)
-    # Heights against the first box's, so that boxes far from z = 0 lose nothing.
-    dz = z1 - z0
-    low = wp.min(-0.5 * h0, dz - 0.5 * h1)
-    high = wp.max(0.5 * h0, dz + 0.5 * h1)
-    shared = wp.max(wp.min(0.5 * h0, dz + 0.5 * h1) - wp.max(-0.5 * h0, dz - 0.5 * h1), 0.0)
-    volume = area * shared
-    union = l0 * w0 * h0 + l1 * w1 * h1 - volume
-    # Rounding must not make the enclosing body smaller than what it holds.
-    body = wp.max(_enclosing_area(x0, y0, l0, w0, yaw0, x1, y1, l1, w1, yaw1, enclosing) * (high - low), union)
-    giou_out[i, j] = volume / union - (body - union) / body
+    if i < counts_in[0] and j < counts_in[1]:
+        area = common_area(shapes_in, i, others_in, j)
+        around = hull_area(shapes_in, i, others_in, j, as_box)
+        giou_out[i, j] = _generalised(shapes_in, i, others_in, j, area, around)
+
+
+@wp.kernel
+def _giou_rows(
+    part: int,
+    parts: int,
+    # in
+    shapes_in: wp.array2d(dtype=wp.float32),
+    others_in: wp.array2d(dtype=wp.float32),
+    counts_in: wp.array(dtype=wp.int32),
+    as_box: bool,
+    rows: int,
+    columns: int,
+    # in out: room for the boxes near one
+    near: wp.array2d(dtype=wp.int32),
+    # out
+    giou_out: wp.array2d(dtype=wp.float32),
+):
+    """Every so many rows: first all pairs as if they did not touch, then those that may."""
+    last = wp.min(counts_in[1], columns)
+    for i in range(part, wp.min(counts_in[0], rows), parts):
+        generalise_apart(shapes_in, i, others_in, last, as_box, giou_out)
+        for k in range(find_near(shapes_in, i, others_in, 0, last, near, part)):
+            j = near[part, k]
+            area = common_area(shapes_in, i, others_in, j)
+            around = hull_area(shapes_in, i, others_in, j, as_box)
+            giou_out[i, j] = _generalised(shapes_in, i, others_in, j, area, around)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pairs:
+    """Workspace for pairs of up to `rows` boxes with up to `columns` others."""
+
+    rows: int
+    columns: int
+    device: str = DEFAULT_DEVICE
+
+    def __post_init__(self):
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"rows and columns must be at least 1, not {self.rows} and {self.columns}")
+        device = resolve_device(self.device)
+
+        def keep(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
+
+        keep("shapes", wp.zeros((SHAPE_ROWS, self.rows), dtype=wp.float32, device=device))
+        keep("other_shapes", wp.zeros((SHAPE_ROWS, self.columns), dtype=wp.float32, device=device))
+        if device == DEFAULT_DEVICE:
+            keep("parts", thread_count())
+            # Lists of different parts end in different lines of the cache.
+            keep("near", wp.zeros((self.parts, self.columns + 32), dtype=wp.int32, device=device))
+
+    def shape(self, boxes: wp.array, others: wp.array) -> None:
+        """Prepares the boxes of both sets."""
+        n, m = boxes.shape[0], others.shape[0]
+        if n > self.rows or m > self.columns:
+            raise ValueError(f"{n} boxes with {m} others are more than the plan's {self.rows} × {self.columns}")
+        for given, shapes in ((boxes, self.shapes), (others, self.other_shapes)):
+            wp.launch(shape_boxes, given.shape[0], inputs=[given, None], outputs=[shapes], device=self.shapes.device)
+
+    def launch(
+        self, rows: wp.Kernel, matrix: wp.Kernel, inputs: list, outputs: list, pairs: tuple[int, int], of_rows: list
+    ) -> None:
+        """Launches the kernel for rows on a CPU, in parts and with inputs of its own, else that for pairs."""
+        if self.shapes.device.is_cpu:
+            parts = max(1, min(self.parts, pairs[0] * pairs[1] // _PAIRS_OF_PART))
+            launch_parts(rows, parts, [*inputs, *of_rows, self.near], outputs)
+        else:
+            wp.launch(matrix, pairs, inputs=inputs, outputs=outputs, device=self.shapes.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,11 +239,9 @@ class RotatedIou:
     """A Warp device, such as `cpu` or `cuda:0`."""
 
     def __post_init__(self):
-        if self.rows < 1 or self.columns < 1:
-            raise ValueError(f"rows and columns must be at least 1, not {self.rows} and {self.columns}")
-        device = resolve_device(self.device)
+        object.__setattr__(self, "_pairs", _Pairs(rows=self.rows, columns=self.columns, device=self.device))
         for name in ("bev", "space"):
-            matrix = wp.zeros((self.rows, self.columns), dtype=wp.float32, device=device)
+            matrix = wp.zeros((self.rows, self.columns), dtype=wp.float32, device=resolve_device(self.device))
             object.__setattr__(self, name, matrix)
 
     def launch(self, boxes: wp.array, others: wp.array, counts: wp.array) -> None:
@@ -297,14 +252,7 @@ class RotatedIou:
             others: Shape (m, 7), float32, m ≤ columns.
             counts: Shape (2,), int32, on the device.
         """
-        _check_fits(self, boxes, others)
-        wp.launch(
-            _iou_matrix,
-            (boxes.shape[0], others.shape[0]),
-            inputs=[boxes, others, counts],
-            outputs=[self.bev, self.space],
-            device=self.bev.device,
-        )
+        _find_overlaps(self._pairs, boxes, others, counts, [self.bev, self.space])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -326,10 +274,9 @@ class GeneralizedIou:
     """A Warp device, such as `cpu` or `cuda:0`."""
 
     def __post_init__(self):
-        if self.rows < 1 or self.columns < 1:
-            raise ValueError(f"rows and columns must be at least 1, not {self.rows} and {self.columns}")
         if self.enclosing not in _ENCLOSINGS:
             raise ValueError(f"enclosing must be one of {', '.join(_ENCLOSINGS)}, not {self.enclosing!r}")
+        object.__setattr__(self, "_pairs", _Pairs(rows=self.rows, columns=self.columns, device=self.device))
         matrix = wp.zeros((self.rows, self.columns), dtype=wp.float32, device=resolve_device(self.device))
         object.__setattr__(self, "giou", matrix)
 
@@ -341,25 +288,34 @@ class GeneralizedIou:
             others: Shape (m, 7), float32, m ≤ columns.
             counts: Shape (2,), int32, on the device.
         """
-        _check_fits(self, boxes, others)
-        wp.launch(
-            _giou_matrix,
-            (boxes.shape[0], others.shape[0]),
-            inputs=[boxes, others, counts, _ENCLOSINGS.index(self.enclosing)],
-            outputs=[self.giou],
-            device=self.giou.device,
-        )
+        _find_generalised(self._pairs, boxes, others, counts, [self.giou], enclosing=self.enclosing)
 
 
-def _check_fits(plan: RotatedIou | GeneralizedIou, boxes: wp.array, others: wp.array) -> None:
-    if boxes.shape[0] > plan.rows or others.shape[0] > plan.columns:
-        raise ValueError(
-            f"{boxes.shape[0]} boxes with {others.shape[0]} others are more than the plan's "
-            f"{plan.rows} × {plan.columns}"
-        )
+def _find_overlaps(
+    pairs: _Pairs, boxes: wp.array, others: wp.array, counts: wp.array, outputs: list, *, is_clear: bool = False
+) -> None:
+    n, m = boxes.shape[0], others.shape[0]
+    pairs.shape(boxes, others)
+    inputs = [pairs.shapes, pairs.other_shapes, counts]
+    pairs.launch(_iou_rows, _iou_matrix, inputs, outputs, (n, m), [n, m, is_clear])
 
 
-def _matrix(a: Any, b: Any, which: str, plan_class: type = RotatedIou, **configuration: Any) -> Any:
+def _find_generalised(
+    pairs: _Pairs, boxes: wp.array, others: wp.array, counts: wp.array, outputs: list, *, enclosing: str
+) -> None:
+    n, m = boxes.shape[0], others.shape[0]
+    pairs.shape(boxes, others)
+    inputs = [pairs.shapes, pairs.other_shapes, counts, enclosing == "box"]
+    pairs.launch(_giou_rows, _giou_matrix, inputs, outputs, (n, m), [n, m])
+
+
+@lru_cache(maxsize=64)
+def _counts_on(n: int, m: int, device: str) -> wp.array:
+    """Two counts on a device, kept between calls: to be read only."""
+    return wp.array([n, m], dtype=wp.int32, device=device)
+
+
+def _matrix(a: Any, b: Any, which: str, **configuration: Any) -> Any:
     family = family_of(a, "a")
     boxes, owner = borrow(a, wp.float32, (None, 7), "a")
     others, other_owner = borrow(b, wp.float32, (None, 7), "b")
@@ -368,17 +324,27 @@ def _matrix(a: Any, b: Any, which: str, plan_class: type = RotatedIou, **configu
     n, m = boxes.shape[0], others.shape[0]
     if n == 0 or m == 0:
         return give(wp.zeros((n, m), dtype=wp.float32, device=boxes.device), family)
-    plan = plan_for(
-        plan_class,
-        rows=capacity_for(n) if n > 64 else 64,
-        columns=capacity_for(m) if m > 64 else 64,
-        device=family.device,
-        **configuration,
-    )
-    plan.launch(boxes, others, wp.array([n, m], dtype=wp.int32, device=boxes.device))
-    result = give(getattr(plan, which)[:n, :m].contiguous(), family)
+    size = {
+        "rows": capacity_for(n) if n > 64 else 64,
+        "columns": capacity_for(m) if m > 64 else 64,
+        "device": family.device,
+    }
+    counts = _counts_on(n, m, family.device)
+    if family.device != DEFAULT_DEVICE:
+        plan = plan_for(GeneralizedIou if which == "giou" else RotatedIou, **size, **configuration)
+        plan.launch(boxes, others, counts)
+        return give(getattr(plan, which)[:n, :m].contiguous(), family)
+    # Straight onto an array of its own, whose pages are zero and not there until something is written to them.
+    host = np.zeros((n, m), np.float32)
+    matrix = wp.array(host, copy=False, device=DEFAULT_DEVICE)
+    pairs = plan_for(_Pairs, **size)
+    if which == "giou":
+        _find_generalised(pairs, boxes, others, counts, [matrix], **configuration)
+    else:
+        outputs = [matrix if which == name else None for name in ("bev", "space")]
+        _find_overlaps(pairs, boxes, others, counts, outputs, is_clear=True)
     del owner, other_owner
-    return result
+    return adopt(host, family)
 
 
 def rotated_iou_bev(a: Any, b: Any) -> Any:
@@ -433,4 +399,4 @@ def giou_3d(a: Any, b: Any, *, enclosing: str = "hull") -> Any:
     """
     if enclosing not in _ENCLOSINGS:
         raise ValueError(f"enclosing must be one of {', '.join(_ENCLOSINGS)}, not {enclosing!r}")
-    return _matrix(a, b, "giou", GeneralizedIou, enclosing=enclosing)
+    return _matrix(a, b, "giou", enclosing=enclosing)

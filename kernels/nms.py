@@ -11,14 +11,20 @@ from typing import Any
 
 import warp as wp
 
-from .device import resolve_device
-from .interop import borrow, family_of, give
-from .iou import bev_intersection
+from .box_overlap import SHAPE_ROWS, common_area, find_near, shape_boxes
+from .device import DEFAULT_DEVICE, resolve_device
+from .interop import borrow, count_on, family_of, give
 from .plan import capacity_for, plan_for
+from .threads import launch_parts, thread_count
 
 __all__ = ["RotatedNms", "rotated_nms"]
 
+# What overlaps too much must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
+
 _LAST = wp.constant(3.0e38)
+_A, _B = (wp.constant(row) for row in (2, 3))
+_PAIRS_OF_PART = 20_000  # pairs for which a thread of their own is worth its while
 
 
 @wp.kernel
@@ -41,38 +47,60 @@ def _sort_keys(
     order_out[i] = i
 
 
+@wp.func
+def _suppresses(shapes: wp.array2d(dtype=wp.float32), i: int, j: int, threshold: float) -> bool:
+    """Whether two boxes overlap too much."""
+    area = common_area(shapes, i, shapes, j)
+    union = 4.0 * (shapes[_A, i] * shapes[_B, i] + shapes[_A, j] * shapes[_B, j]) - area
+    return area > threshold * union
+
+
 @wp.kernel
 def _overlap_bits(
     # in
-    boxes_in: wp.array2d(dtype=wp.float32),
+    shapes_in: wp.array2d(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
-    order_in: wp.array(dtype=wp.int32),
+    boxes: int,
     threshold: float,
     # out
     bits_out: wp.array2d(dtype=wp.uint32),
 ):
     """Bit j of row i: box j, later in the order than i, overlaps it too much."""
     i, word = wp.tid()  # pyright: ignore[reportAssignmentType]
-    n = wp.min(count_in[0], boxes_in.shape[0])
+    n = wp.min(count_in[0], boxes)
     if i >= n or word * 32 >= n or word * 32 + 31 <= i:
         return
-    a = order_in[i]
-    x = boxes_in[a, 0]
-    y = boxes_in[a, 1]
-    length = boxes_in[a, 3]
-    width = boxes_in[a, 4]
-    yaw = boxes_in[a, 6]
     bits = wp.uint32(0)
     for k in range(32):
         j = word * 32 + k
-        if j > i and j < n:
-            b = order_in[j]
-            l1 = boxes_in[b, 3]
-            w1 = boxes_in[b, 4]
-            area = bev_intersection(x, y, length, width, yaw, boxes_in[b, 0], boxes_in[b, 1], l1, w1, boxes_in[b, 6])
-            if area > threshold * (length * width + l1 * w1 - area):
-                bits = bits | (wp.uint32(1) << wp.uint32(k))
+        if j > i and j < n and _suppresses(shapes_in, i, j, threshold):
+            bits = bits | (wp.uint32(1) << wp.uint32(k))
     bits_out[i, word] = bits
+
+
+@wp.kernel
+def _overlap_bits_in_parts(
+    part: int,
+    parts: int,
+    # in
+    shapes_in: wp.array2d(dtype=wp.float32),
+    count_in: wp.array(dtype=wp.int32),
+    boxes: int,
+    threshold: float,
+    # in out: room for the boxes near one
+    near: wp.array2d(dtype=wp.int32),
+    # out
+    bits_out: wp.array2d(dtype=wp.uint32),
+):
+    """Every so many rows; only boxes that may touch are looked at."""
+    n = wp.min(count_in[0], boxes)
+    for i in range(part, n, parts):
+        for word in range((i + 1) // 32, (n + 31) // 32):
+            bits_out[i, word] = wp.uint32(0)
+        for k in range(find_near(shapes_in, i, shapes_in, i + 1, n, near, part)):
+            j = near[part, k]
+            if _suppresses(shapes_in, i, j, threshold):
+                bits_out[i, j // 32] = bits_out[i, j // 32] | (wp.uint32(1) << wp.uint32(j % 32))
 
 
 @wp.kernel
@@ -143,8 +171,12 @@ class RotatedNms:
         words = (self.capacity + 31) // 32
         buffer("_keys", 2 * self.capacity, wp.float32)
         buffer("_order", 2 * self.capacity, wp.int32)
+        buffer("_shapes", (SHAPE_ROWS, self.capacity), wp.float32)
         buffer("_bits", (self.capacity, words), wp.uint32)
         buffer("_gone", words, wp.uint32)
+        if device == DEFAULT_DEVICE:
+            object.__setattr__(self, "_parts", thread_count())
+            buffer("_near", (self._parts, self.capacity + 32), wp.int32)
         buffer("keep", self.max_output, wp.int32)
         buffer("keep_count", 1, wp.int32)
         buffer("dropped", 1, wp.int32)
@@ -163,13 +195,13 @@ class RotatedNms:
         device = self.keep.device
         wp.launch(_sort_keys, self.capacity, inputs=[scores, count], outputs=[self._keys, self._order], device=device)
         wp.utils.radix_sort_pairs(self._keys, self._order, self.capacity)
-        wp.launch(
-            _overlap_bits,
-            (n, (n + 31) // 32),
-            inputs=[boxes, count, self._order, self.threshold],
-            outputs=[self._bits],
-            device=device,
-        )
+        wp.launch(shape_boxes, n, inputs=[boxes, self._order], outputs=[self._shapes], device=device)
+        inputs = [self._shapes, count, n, self.threshold]
+        if device.is_cpu:
+            parts = max(1, min(self._parts, n * n // _PAIRS_OF_PART))
+            launch_parts(_overlap_bits_in_parts, parts, [*inputs, self._near], [self._bits])
+        else:
+            wp.launch(_overlap_bits, (n, (n + 31) // 32), inputs=inputs, outputs=[self._bits], device=device)
         wp.launch(
             _keep_greedily,
             1,
@@ -204,7 +236,7 @@ def rotated_nms(boxes: Any, scores: Any, threshold: float, max_output: int | Non
     )
     kept = 0
     if n:
-        plan.launch(borrowed, ranks, wp.array([n], dtype=wp.int32, device=borrowed.device))
+        plan.launch(borrowed, ranks, count_on(n, family.device))
         kept = int(plan.keep_count.numpy()[0])
     del owner, scores_owner
     if max_output is not None:

@@ -6,7 +6,9 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warploom.kernels.iou import GeneralizedIou, giou_3d, iou_3d, rotated_iou_bev
+from warploom.kernels import iou
+from warploom.kernels.iou import GeneralizedIou, RotatedIou, giou_3d, iou_3d, rotated_iou_bev
+from warploom.kernels.threads import set_thread_count, thread_count
 from warploom.models.geometry import box_overlap
 
 
@@ -166,17 +168,17 @@ def test_giou_agrees_with_shapelys_convex_hulls(device):
     """Within 3e-5, the rounding of float32 coordinates of some metres."""
     rng = np.random.default_rng(6)
     a, b = some_boxes(rng, 90), some_boxes(rng, 80)
-    _, iou = reference(a, b)
+    _, overlap = reference(a, b)
     a64, b64 = a.astype(np.float64), b.astype(np.float64)
     volume = [boxes[:, 3] * boxes[:, 4] * boxes[:, 5] for boxes in (a64, b64)]
     both = volume[0][:, None] + volume[1][None, :]
-    union = both / (1 + iou)
+    union = both / (1 + overlap)
     top = np.maximum((a64[:, 2] + a64[:, 5] / 2)[:, None], (b64[:, 2] + b64[:, 5] / 2)[None, :])
     low = np.minimum((a64[:, 2] - a64[:, 5] / 2)[:, None], (b64[:, 2] - b64[:, 5] / 2)[None, :])
     body = enclosing_hulls(a, b) * (top - low)
     got = giou_3d(on(device, a), on(device, b))
     got = got if isinstance(got, np.ndarray) else got.numpy()
-    np.testing.assert_allclose(got, iou - (body - union) / body, atol=3e-5)
+    np.testing.assert_allclose(got, overlap - (body - union) / body, atol=3e-5)
 
 
 def test_giou_with_the_box_along_the_first_agrees_with_numpys(device):
@@ -249,3 +251,103 @@ def test_giou_refuses_what_it_does_not_know():
         GeneralizedIou(rows=1, columns=1, enclosing="sphere")
     with pytest.raises(ValueError, match="more than the plan's 1 × 1"):
         GeneralizedIou(rows=1, columns=1).launch(wp.zeros((2, 7)), wp.zeros((2, 7)), wp.zeros(2, dtype=int))
+
+
+def crossed(boxes, others):
+    """All three overlaps by the kernels that a GPU runs, one thread a pair."""
+    n, m = len(boxes), len(others)
+    given_boxes, given_others = (wp.array(array, dtype=wp.float32, device="cpu") for array in (boxes, others))
+    pairs = iou._Pairs(rows=n, columns=m, device="cpu")
+    pairs.shape(given_boxes, given_others)
+    counts = wp.array([n, m], dtype=wp.int32, device="cpu")
+    bev, space, hull, box = (wp.empty((n, m), dtype=wp.float32, device="cpu") for _ in range(4))
+    inputs = [pairs.shapes, pairs.other_shapes, counts]
+    wp.launch(iou._iou_matrix, (n, m), inputs=inputs, outputs=[bev, space], device="cpu")
+    for out, as_box in ((hull, False), (box, True)):
+        wp.launch(iou._giou_matrix, (n, m), inputs=[*inputs, as_box], outputs=[out], device="cpu")
+    return [array.numpy() for array in (bev, space, hull, box)]
+
+
+def called(boxes, others):
+    ious = [rotated_iou_bev(boxes, others), iou_3d(boxes, others)]
+    return ious + [giou_3d(boxes, others, enclosing=enclosing) for enclosing in ("hull", "box")]
+
+
+def odd_boxes(rng, n):
+    """Some of no area, not finite, of the same place, or very far."""
+    boxes = some_boxes(rng, n)
+    boxes[rng.random(n) < 0.2] = boxes[0]
+    boxes[rng.random(n) < 0.1, :2] += 1e5
+    odd = rng.random((n, 7)) < 0.02
+    boxes[odd] = rng.choice(np.float32([0, -1, np.nan, np.inf, -np.inf, 1e-45, 3e38]), odd.sum())
+    return boxes
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 150), st.integers(1, 90))
+def test_rows_and_pairs_give_the_same_bytes(seed, n, m):
+    """A CPU looks only at boxes that are near, and a GPU at all."""
+    rng = np.random.default_rng(seed)
+    boxes, others = odd_boxes(rng, n), odd_boxes(rng, m)
+    for ours, theirs in zip(called(boxes, others), crossed(boxes, others), strict=True):
+        assert ours.tobytes() == theirs.tobytes()
+        assert np.isfinite(ours).all()
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_parts_do_not_change_a_byte(parts):
+    rng = np.random.default_rng(8)
+    boxes, others = odd_boxes(rng, 400), odd_boxes(rng, 300)
+    expected, before = called(boxes, others), thread_count()
+    given_boxes, given_others = (wp.array(array, dtype=wp.float32, device="cpu") for array in (boxes, others))
+    counts = wp.array([400, 300], dtype=wp.int32, device="cpu")
+    try:
+        set_thread_count(parts)
+        both = RotatedIou(rows=400, columns=300, device="cpu")
+        plans = [GeneralizedIou(rows=400, columns=300, enclosing=e, device="cpu") for e in ("hull", "box")]
+    finally:
+        set_thread_count(before)
+    for plan in (both, *plans):
+        plan.launch(given_boxes, given_others, counts)
+    got = [both.bev, both.space, *(plan.giou for plan in plans)]
+    for ours, theirs in zip(got, expected, strict=True):
+        assert ours.numpy().tobytes() == theirs.tobytes()
+
+
+def test_a_plan_forgets_what_overlapped_before():
+    rng = np.random.default_rng(9)
+    plan = RotatedIou(rows=50, columns=50, device="cpu")
+    for n, m in ((50, 50), (30, 40), (50, 20)):
+        boxes, others = some_boxes(rng, 50), some_boxes(rng, 50)
+        given_so = [wp.array(array, dtype=wp.float32, device="cpu") for array in (boxes, others)]
+        plan.launch(*given_so, wp.array([n, m], dtype=wp.int32, device="cpu"))
+        assert np.array_equal(plan.bev.numpy()[:n, :m], rotated_iou_bev(boxes[:n], others[:m]))
+        assert np.array_equal(plan.space.numpy()[:n, :m], iou_3d(boxes[:n], others[:m]))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-3, 3), st.floats(-50, 50), st.floats(-50, 50))
+def test_a_turn_and_a_shift_of_all_boxes_change_nothing(seed, turn, x, y):
+    """Within 5e-5: coordinates of 60 m are rounded to 4e-6 m."""
+    rng = np.random.default_rng(seed)
+    boxes, others = some_boxes(rng, 15, 3.0), some_boxes(rng, 15, 3.0)
+    c, s = np.cos(turn), np.sin(turn)
+    moved = []
+    for given_so in (boxes, others):
+        wide = given_so.astype(np.float64)
+        wide[:, :2] = wide[:, :2] @ np.array([[c, s], [-s, c]]) + (x, y)
+        wide[:, 6] += turn
+        moved.append(wide.astype(np.float32))
+    for before, after in zip(called(boxes, others), called(*moved), strict=True):
+        np.testing.assert_allclose(after, before, atol=5e-5)
+
+
+def test_other_floats_strides_and_read_only_arrays():
+    rng = np.random.default_rng(10)
+    wide = np.zeros((40, 9))
+    wide[:, 1:8] = some_boxes(rng, 40)
+    wide.setflags(write=False)
+    boxes = wide[::2, 1:8]
+    plain = np.ascontiguousarray(boxes, np.float32)
+    for ours, theirs in zip(called(boxes, boxes), called(plain, plain), strict=True):
+        assert np.array_equal(ours, theirs)

@@ -6,8 +6,10 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warploom.kernels import nms
 from warploom.kernels.iou import rotated_iou_bev
 from warploom.kernels.nms import RotatedNms, rotated_nms
+from warploom.kernels.threads import set_thread_count, thread_count
 
 
 def crowded(rng, n):
@@ -111,3 +113,23 @@ def test_wrong_arguments_are_refused():
         rotated_nms(boxes, scores[:2], 0.5)
     with pytest.raises(ValueError, match="threshold must be in"):
         rotated_nms(boxes, scores, 1.5)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_parts_and_all_pairs_give_the_same_bits(parts):
+    """A CPU looks only at boxes that are near, in parts; a GPU at all."""
+    boxes, scores = crowded(np.random.default_rng(12), 500)
+    boxes[::50, 3], boxes[7::60, 0], boxes[11::70, 6] = 0.0, np.nan, np.inf
+    before = thread_count()
+    try:
+        set_thread_count(parts)
+        plan = RotatedNms(capacity=512, threshold=0.2, max_output=512, device="cpu")
+    finally:
+        set_thread_count(before)
+    count = wp.array([500], dtype=wp.int32, device="cpu")
+    plan.launch(wp.array(boxes, dtype=wp.float32, device="cpu"), wp.array(scores, device="cpu"), count)
+    bits = wp.zeros_like(plan._bits)
+    wp.launch(nms._overlap_bits, (500, 16), inputs=[plan._shapes, count, 500, 0.2], outputs=[bits], device="cpu")
+    for i in range(500):
+        assert np.array_equal(plan._bits.numpy()[i, (i + 1) // 32 :], bits.numpy()[i, (i + 1) // 32 :])
+    assert plan.keep.numpy()[: plan.keep_count.numpy()[0]].tolist() == rotated_nms(boxes, scores, 0.2).tolist()
