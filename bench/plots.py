@@ -12,7 +12,8 @@ from .results import Pair, Result
 __all__ = ["draw_cost", "draw_ratios"]
 
 _FONT = "font-family='system-ui,sans-serif'"
-_OURS, _PEERS = "#0b62c4", ("#c2410c", "#15803d", "#9333ea", "#b45309", "#0e7490", "#be123c")
+_OURS = "#0b62c4"
+_PEERS = ("#c2410c", "#15803d", "#9333ea", "#a16207", "#0e7490", "#db2777", "#4d7c0f", "#6b7280", "#7f1d1d", "#111827")
 _INK, _FAINT = "#222", "#ccc"
 _STREET = re.compile(r"street (10k|120k|500k|2M)")
 _LEAST_SIZES = 3  # that a curve needs
@@ -45,8 +46,8 @@ def draw_ratios(pairs: Sequence[Pair]) -> str:
     rows = [pair for pair in pairs if pair.ratio is not None and pair.goal is not None]
     if not rows:
         return ""
-    left, right, top, step = 330, 130, 44, 20
-    width, height = 860, top + step * len(rows) + 14
+    left, right, top, step = 330, 180, 44, 20
+    width, height = 900, top + step * len(rows) + 14
     span = width - left - right
 
     def across(value: float) -> float:
