@@ -35,7 +35,7 @@ __all__ = [
 
 OURS, PLAN, ONE_THREAD = "warploom", "warploom plan", "warploom, 1 thread"
 _SLOW = 0.1  # [s] a call, from which three rounds must do
-_WATCHED = 0.03  # [s] that the processor is watched for how many cores are busy
+_WATCHED, _LEAST_WATCH = 0.05, 0.002  # [s] that a call is watched before it is timed, in all and in one go
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,9 @@ class Contest:
         device = contender.device
         call = prepare(device)
         timed = call if device == DEFAULT_DEVICE else _finished(call, device)
-        timed()
-        start = time.perf_counter()
-        timed()
-        once = time.perf_counter() - start
+        if contender.is_ours:
+            timed()
+        once, busy_cores = _watch(timed)
         info = self._benchmark.extra_info
         info.update(
             kernel=kernel,
@@ -198,7 +197,7 @@ class Contest:
         if isinstance(call, SelfTimed):
             info["own_timer_s"] = float(np.median(call.taken))
         if device == DEFAULT_DEVICE:
-            info["busy_cores"] = _busy_cores(timed, once)
+            info["busy_cores"] = busy_cores
 
 
 @contextmanager
@@ -211,13 +210,23 @@ def _one_thread() -> Iterator[None]:
         set_thread_count(before)
 
 
-def _busy_cores(call: Callable[[], Any], once: float) -> float:
-    """How many cores a call keeps busy: the processor's time over that of the clock."""
-    repeats = max(1, round(_WATCHED / max(once, 1e-6)))
-    clock, processor = time.perf_counter(), time.process_time()
-    for _ in range(repeats):
-        call()
-    return (time.process_time() - processor) / (time.perf_counter() - clock)
+def _watch(call: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds of a call, and how many cores it keeps busy: the processor's time over that of the clock.
+
+    Where others disturb the calls, the least disturbed ones tell.
+    """
+    repeats, shortest, busiest, left = 1, float("inf"), 0.0, _WATCHED
+    while left > 0:
+        clock, processor = time.perf_counter(), time.process_time()
+        for _ in range(repeats):
+            call()
+        processor, clock = time.process_time() - processor, time.perf_counter() - clock
+        shortest = min(shortest, clock / repeats)
+        if repeats * shortest > _LEAST_WATCH:
+            busiest = max(busiest, processor / clock)
+        left -= clock
+        repeats = max(1, round(2 * _LEAST_WATCH / shortest))
+    return shortest, busiest
 
 
 def _finished(call: Callable[[], Any], device: str) -> Callable[[], None]:

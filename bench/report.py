@@ -16,7 +16,7 @@ from ..errors import ConfigError
 from .plots import draw_cost, draw_ratios
 from .results import Pair, Result, read_measured, read_pairs, read_results
 
-__all__ = ["number", "render", "score_row", "share", "write_report"]
+__all__ = ["number", "render", "score_row", "share", "skipped_lines", "write_report"]
 
 
 def write_report(measured: dict[str, Any], out: Path) -> list[Path]:
@@ -92,7 +92,7 @@ def _machine(measured: dict[str, Any]) -> Iterator[str]:
     yield f"- machine: {said['processor']}, {said['cores']} cores{memory}, {said['system']}; GPU: {devices}"
     yield f"- date: {measured['datetime'][:10]}"
     commit = measured.get("commit_info") or {}
-    if commit.get("id"):
+    if commit.get("id", "unversioned") != "unversioned":
         yield f"- commit: {commit['id'][:12]}{' and changes' if commit.get('dirty') else ''}"
     yield "- versions: Python " + ", ".join([said["python"], *(f"{n} {v}" for n, v in said["versions"].items())])
     yield ""
@@ -278,16 +278,21 @@ def _first_calls(measured: dict[str, Any]) -> Iterator[str]:
         )
 
 
+def skipped_lines(measured: dict[str, Any]) -> list[str]:
+    """What was not measured, by reason."""
+    reasons: dict[str, list[str]] = {}
+    for name, reason in measured["warploom"]["skipped"].items():
+        reasons.setdefault(reason, []).append(name)
+    return [
+        f"{reason}: {', '.join(f'`{name}`' for name in names[:3])}"
+        f"{f' and {len(names) - 3} more' if len(names) > 3 else ''}"
+        for reason, names in reasons.items()
+    ]
+
+
 def _skipped(measured: dict[str, Any]) -> Iterator[str]:
-    skipped = measured["warploom"]["skipped"]
-    if skipped:
-        reasons: dict[str, list[str]] = {}
-        for name, reason in skipped.items():
-            reasons.setdefault(reason, []).append(name)
-        yield from ("## Not measured", "")
-        for reason, names in reasons.items():
-            some = ", ".join(f"`{name}`" for name in names[:3])
-            yield f"- {reason}: {some}{f' and {len(names) - 3} more' if len(names) > 3 else ''}"
+    if lines := skipped_lines(measured):
+        yield from ("## Not measured", "", *(f"- {line}" for line in lines))
 
 
 def _milliseconds(result: Result | None) -> str:

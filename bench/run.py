@@ -20,7 +20,7 @@ from rich.table import Table
 from ..errors import ConfigError, SinkError, WarploomError
 from ..kernels.device import resolve_device
 from .compare import SLOWER, compare_pairs, compare_times
-from .report import number, score_row, share, write_report
+from .report import number, score_row, share, skipped_lines, write_report
 from .results import Pair, read_measured, read_pairs, read_results
 
 __all__ = ["BenchmarkError", "run_benchmarks"]
@@ -93,9 +93,8 @@ def run_benchmarks(
     _print_others(console, measured)
     if old is not None:
         _print_changes(console, old, measured)
-    for name, reason in measured["warploom"]["skipped"].items():
-        if "CUDA" not in reason:
-            console.print(f"not measured: {name}: {reason}", style="dim", highlight=False, markup=False)
+    for line in skipped_lines(measured):
+        console.print(f"not measured: {line}", style="dim", highlight=False, markup=False)
     console.print(f"written: {', '.join(str(path) for path in (written, *files))}", highlight=False)
     if failures:
         raise BenchmarkError("; ".join(failures))
