@@ -19,9 +19,12 @@ import warp as wp
 
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
-from .ground_plane import FIRST_RING, RING_BITS, RINGS, SEGMENTS, GroundPlane, above, cell_of, lowest_point, part_end
+from .ground_parts import GroundLimits, judge_cells_part, judge_points_part
+from .ground_plane import GroundPlane, above, lowest_point
 from .interop import adopt, borrow_points, count_on, give
+from .parts import part_start
 from .plan import capacity_for, plan_for
+from .polar_grid import FIRST_RING, RING_BITS, RINGS, SEGMENTS, cell_of
 from .threads import launch_parts
 
 __all__ = ["Ground", "GroundSegment", "elevation_grid", "segment_ground"]
@@ -128,7 +131,7 @@ def _sweep_part(
     rise_out: wp.array(dtype=wp.float32),
 ):
     """Some of the segments."""
-    for segment in range(part_end(SEGMENTS, part - 1, parts), part_end(SEGMENTS, part, parts)):
+    for segment in range(part_start(SEGMENTS, part, parts), part_start(SEGMENTS, part + 1, parts)):
         _sweep(segment, xyz_in, cells_in, plane_in[0], radius_in, rise_out)
 
 
@@ -161,32 +164,6 @@ def _reconciled(rise: wp.array(dtype=wp.float32), radius: wp.array(dtype=wp.floa
     )
 
 
-@wp.func
-def _judge_cell(
-    cell: int,
-    cells_in: wp.array2d(dtype=wp.int64),
-    rise_in: wp.array(dtype=wp.float32),
-    radius_in: wp.array(dtype=wp.float32),
-    centre_in: wp.array(dtype=wp.vec2),
-    plane: wp.vec3,
-    surface_out: wp.array(dtype=wp.vec4),
-):
-    """Of a cell with points: the rise of its surface as u + v r², and the heights between which points are ground."""
-    if cells_in[cell, 0] == wp.int64(0):
-        return
-    surface = _reconciled(rise_in, radius_in, cell)
-    r = radius_in[cell & (RINGS - 1)]
-    centre = centre_in[cell]
-    z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
-    # A wall, a car, a trunk stands on the cell if the levels above its surface have points.
-    level = wp.uint64(int(wp.ceil((1000.0 + wp.clamp(z, -900.0, 900.0) + _STANDS_FROM) * 4.0)) & 63)
-    levels = wp.uint64(cells_in[cell, 1])
-    levels = (levels >> level) | (levels << ((wp.uint64(64) - level) & wp.uint64(63)))
-    top = wp.where((levels & _STANDS_LEVELS) == wp.uint64(0), _TOP_BARE, _TOP_OCCUPIED)
-    half = 0.5 * surface[1]
-    surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
-
-
 @wp.kernel
 def _judge_cells(
     # in
@@ -198,51 +175,22 @@ def _judge_cells(
     # out
     surface_out: wp.array(dtype=wp.vec4),
 ):
-    """One cell a thread."""
-    _judge_cell(wp.tid(), cells_in, rise_in, radius_in, centre_in, plane_in[0], surface_out)
-
-
-@wp.kernel
-def _judge_cells_part(
-    # in
-    part: int,
-    parts: int,
-    cells_in: wp.array2d(dtype=wp.int64),
-    rise_in: wp.array(dtype=wp.float32),
-    radius_in: wp.array(dtype=wp.float32),
-    centre_in: wp.array(dtype=wp.vec2),
-    plane_in: wp.array(dtype=wp.vec3),
-    # out
-    surface_out: wp.array(dtype=wp.vec4),
-):
-    """Some of the cells."""
-    size = SEGMENTS * RINGS
-    for cell in range(part_end(size, part - 1, parts), part_end(size, part, parts)):
-        _judge_cell(cell, cells_in, rise_in, radius_in, centre_in, plane_in[0], surface_out)
-
-
-@wp.func
-def _judge_point(
-    i: int,
-    xyz_in: wp.array(dtype=wp.vec3),
-    cell_in: wp.array(dtype=wp.int32),
-    plane: wp.vec3,
-    surface_in: wp.array(dtype=wp.vec4),
-    mask_out: wp.array(dtype=wp.bool),
-    height_out: wp.array(dtype=wp.float32),
-):
-    """The height of a point above the surface of its cell, and whether that is ground."""
-    cell = cell_in[i]
-    if cell < 0:
-        mask_out[i] = False
-        height_out[i] = wp.nan
+    """Per cell with points: the rise of its surface as u + v r², and the heights between which points are ground."""
+    cell = wp.tid()
+    if cells_in[cell, 0] == wp.int64(0):
         return
-    p = xyz_in[i]
-    surface = surface_in[cell]
-    r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
-    height = above(plane, p) - surface[0] - surface[1] * r2
-    height_out[i] = height
-    mask_out[i] = height < surface[2] and height > surface[3]
+    surface = _reconciled(rise_in, radius_in, cell)
+    r = radius_in[cell & (RINGS - 1)]
+    centre = centre_in[cell]
+    plane = plane_in[0]
+    z = surface[0] + plane[0] * centre[0] + plane[1] * centre[1] + plane[2]
+    # A wall, a car, a trunk stands on the cell if the levels above its surface have points.
+    level = wp.uint64(int(wp.ceil((1000.0 + wp.clamp(z, -900.0, 900.0) + _STANDS_FROM) * 4.0)) & 63)
+    levels = wp.uint64(cells_in[cell, 1])
+    levels = (levels >> level) | (levels << ((wp.uint64(64) - level) & wp.uint64(63)))
+    top = wp.where((levels & _STANDS_LEVELS) == wp.uint64(0), _TOP_BARE, _TOP_OCCUPIED)
+    half = 0.5 * surface[1]
+    surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
 
 
 @wp.kernel
@@ -257,31 +205,21 @@ def _judge_points(
     mask_out: wp.array(dtype=wp.bool),
     height_out: wp.array(dtype=wp.float32),
 ):
-    """One point a thread."""
+    """The height of each point above the surface of its cell, and whether that is ground."""
     i = wp.tid()
-    if i < count_in[0]:
-        _judge_point(i, xyz_in, cell_in, plane_in[0], surface_in, mask_out, height_out)
-
-
-@wp.kernel
-def _judge_points_part(
-    # in
-    part: int,
-    parts: int,
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    cell_in: wp.array(dtype=wp.int32),
-    plane_in: wp.array(dtype=wp.vec3),
-    surface_in: wp.array(dtype=wp.vec4),
-    # out
-    mask_out: wp.array(dtype=wp.bool),
-    height_out: wp.array(dtype=wp.float32),
-):
-    """Some of the points."""
-    n = wp.min(count_in[0], xyz_in.shape[0])
-    plane = plane_in[0]
-    for i in range(part_end(n, part - 1, parts), part_end(n, part, parts)):
-        _judge_point(i, xyz_in, cell_in, plane, surface_in, mask_out, height_out)
+    if i >= count_in[0]:
+        return
+    cell = cell_in[i]
+    if cell < 0:
+        mask_out[i] = False
+        height_out[i] = wp.nan
+        return
+    p = xyz_in[i]
+    surface = surface_in[cell]
+    r2 = wp.min(p[0] * p[0] + p[1] * p[1], _FARTHEST)
+    height = above(plane_in[0], p) - surface[0] - surface[1] * r2
+    height_out[i] = height
+    mask_out[i] = height < surface[2] and height > surface[3]
 
 
 @wp.kernel
@@ -355,7 +293,12 @@ class GroundSegment:
 
         size = int(SEGMENTS * RINGS)
         radius, centre = _grid_centres()
+        limits = GroundLimits()
+        limits.off_median, limits.gradient, limits.stands_from = _OFF_MEDIAN, _GRADIENT_LIMIT, _STANDS_FROM
+        limits.stands_levels, limits.top_bare, limits.top_occupied = _STANDS_LEVELS, _TOP_BARE, _TOP_OCCUPIED
+        limits.bottom, limits.bottom_per_metre, limits.farthest = _BOTTOM, _BOTTOM_PER_METRE, _FARTHEST
         keep("_fit", fit)
+        keep("_limits", limits)
         keep("plane", fit.plane)
         keep("found_height", fit.found_height)
         keep("_radius", wp.array(radius, dtype=wp.float32, device=device))
@@ -395,8 +338,8 @@ class GroundSegment:
         points = [xyz, count, fit.cell, fit.plane, self._surface]
         if fit.parts:
             launch_parts(_sweep_part, fit.parts, sweep, [self._rise])
-            launch_parts(_judge_cells_part, fit.parts, cells, [self._surface])
-            launch_parts(_judge_points_part, fit.parts, points, [mask, height])
+            launch_parts(judge_cells_part, fit.parts, [*cells, self._limits], [self._surface])
+            launch_parts(judge_points_part, fit.parts, [*points, self._limits], [mask, height])
             return
         self._run(_sweep_segments, int(SEGMENTS), sweep, [self._rise])
         self._run(_judge_cells, int(SEGMENTS * RINGS), cells, [self._surface])

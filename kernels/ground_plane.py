@@ -16,29 +16,15 @@ from typing import Any
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
+from .ground_parts import bin_part
+from .parts import part_start
+from .polar_grid import FIRST_RING, LOW_WORD, RING_BITS, RINGS, SEGMENTS, cell_of
 from .threads import launch_parts, thread_count
 
-__all__ = [
-    "FIRST_RING",
-    "RINGS",
-    "RING_BITS",
-    "SEGMENTS",
-    "GroundPlane",
-    "above",
-    "cell_of",
-    "lowest_point",
-    "part_end",
-]
+__all__ = ["FIRST_RING", "RINGS", "RING_BITS", "SEGMENTS", "GroundPlane", "above", "lowest_point"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
-
-# The polar grid. A ring is an eighth of an octave of r², so its width is 3 to 6 % of its radius: the float's own bits
-# name it. Segments divide the diamond |x| + |y| = 1 evenly, so they are 0.9 to 1.8° wide.
-SEGMENTS = wp.constant(256)
-RINGS = wp.constant(128)
-RING_BITS = wp.constant(20)
-FIRST_RING = wp.constant(127 * 8)  # the upper bits of 1 m²
 
 # The patches whose lowest points the plane is fitted to: 32 sectors, 8 octaves of r² from 2 to 32 m.
 _SECTORS = wp.constant(32)
@@ -53,19 +39,7 @@ _HEIGHT_SLACK = wp.constant(0.5)  # [m] between the height given and the plane f
 _DEFAULT_HEIGHT = wp.constant(1.8)
 
 _HASH = wp.constant(wp.uint32(2654435761))
-_LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))
 _FIX = wp.constant(wp.float64(1048576.0))
-
-
-@wp.func
-def cell_of(x: float, y: float) -> int:
-    """The polar cell of a position: segment × rings + ring."""
-    # The angle as the diamond's, 0 to 4: monotone in the true one, for one division.
-    angle = x / (wp.abs(x) + wp.abs(y) + 1.0e-30)
-    angle = wp.where(y < 0.0, 3.0 + angle, 1.0 - angle)
-    segment = int(angle * (float(SEGMENTS) * 0.25)) & (SEGMENTS - 1)
-    ring = (wp.cast(x * x + y * y, wp.int32) >> RING_BITS) - FIRST_RING
-    return segment * RINGS + wp.clamp(ring, 0, RINGS - 1)
 
 
 @wp.func
@@ -77,7 +51,7 @@ def _is_finite(p: wp.vec3) -> bool:
 def _depth_key(z: float, i: int) -> wp.int64:
     """Grows with the depth of a point below 1000 m, in millimetres; of equals, the first has the highest."""
     depth = wp.int64(int((1000.0 - z) * 1000.0))
-    return (depth << wp.int64(32)) | (_LOW_WORD - wp.int64(i))
+    return (depth << wp.int64(32)) | (LOW_WORD - wp.int64(i))
 
 
 @wp.func
@@ -112,42 +86,9 @@ def _bin_points(
 
 
 @wp.func
-def part_end(length: int, part: int, parts: int) -> int:
-    """Where part `part` of so many equal ones ends, and the next begins."""
-    return int(wp.int64(length) * wp.int64(part + 1) / wp.int64(parts))
-
-
-@wp.kernel
-def _bin_part(
-    # in
-    part: int,
-    parts: int,
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    # in out: zero
-    tables: wp.array2d(dtype=wp.int64),
-    # out
-    cell_out: wp.array(dtype=wp.int32),
-):
-    """The same of one part of the points, whose table is one of those that lie below each other."""
-    n = wp.min(count_in[0], xyz_in.shape[0])
-    base = part * SEGMENTS * RINGS
-    for i in range(part_end(n, part - 1, parts), part_end(n, part, parts)):
-        p = xyz_in[i]
-        cell = int(-1)
-        if _is_finite(p):
-            cell = cell_of(p[0], p[1])
-            row = base + cell
-            z = wp.clamp(p[2], -999.0, 999.0)
-            tables[row, 0] = wp.max(tables[row, 0], _depth_key(z, i))
-            tables[row, 1] = tables[row, 1] | _level_bit(z)
-        cell_out[i] = cell
-
-
-@wp.func
 def lowest_point(xyz: wp.array(dtype=wp.vec3), key: wp.int64) -> wp.vec3:
     """The lowest point of a cell by the cell's key."""
-    return xyz[int(_LOW_WORD - (key & _LOW_WORD))]
+    return xyz[int(LOW_WORD - (key & LOW_WORD))]
 
 
 @wp.func
@@ -191,8 +132,8 @@ def _merge_part(
 ):
     """Merges the cells of some sectors and picks the candidates there."""
     size = SEGMENTS * RINGS
-    first = part_end(_SECTORS, part - 1, parts)
-    last = part_end(_SECTORS, part, parts)
+    first = part_start(_SECTORS, part, parts)
+    last = part_start(_SECTORS, part + 1, parts)
     for other in range(1, parts):
         for cell in range(first * 8 * RINGS, last * 8 * RINGS):
             tables[cell, 0] = wp.max(tables[cell, 0], tables[other * size + cell, 0])
@@ -277,7 +218,7 @@ def _vote_planes(
 @wp.func
 def _add_inlier(candidates: wp.array(dtype=wp.vec4), number: int, best: wp.int64, sums: wp.array(dtype=wp.int64)):
     """Adds a candidate that is on the winner to the normal equations of the least-squares plane, in fixed point."""
-    plane = _hypothesis(candidates, _HYPOTHESES - int(best & _LOW_WORD))
+    plane = _hypothesis(candidates, _HYPOTHESES - int(best & LOW_WORD))
     candidate = candidates[number]
     off = above(plane, _position(candidate))
     if wp.abs(off) < candidate[3]:
@@ -318,7 +259,7 @@ def _fitted_plane(
     """The winner's plane after the fit, or the level one at the height given or usual if there is no winner."""
     if best == wp.int64(0):
         return wp.vec3(0.0, 0.0, -wp.where(wp.isnan(sensor_height), _DEFAULT_HEIGHT, sensor_height))
-    plane = _hypothesis(candidates, _HYPOTHESES - int(best & _LOW_WORD))
+    plane = _hypothesis(candidates, _HYPOTHESES - int(best & LOW_WORD))
     n = wp.float64(sums[0]) * _FIX
     x = wp.float64(sums[1]) / n
     y = wp.float64(sums[2]) / n
@@ -447,7 +388,7 @@ class GroundPlane:
         given = math.nan if self.sensor_height is None else self.sensor_height
         self._scratch.zero_()
         if self.parts:
-            launch_parts(_bin_part, self.parts, [xyz, count, self._tables], [self.cell])
+            launch_parts(bin_part, self.parts, [xyz, count, self._tables], [self.cell])
             launch_parts(_merge_part, self.parts, [xyz, self._tables], [self._candidate])
             self._run(_fit_in_order, 1, [self._candidate, given, self._sums], [self.plane, self.found_height])
             return
