@@ -26,9 +26,11 @@ __all__ = [
     "is_finite",
     "is_near",
     "join_levels",
+    "level_of_x",
     "radius_of",
     "touch",
     "unite",
+    "x_of_level",
 ]
 
 _LARGEST_CELL = wp.constant(wp.float64(2.0**30))
@@ -100,21 +102,38 @@ def _growth_of(level: int) -> wp.float64:
 
 
 @wp.func
+def level_of_x(x: int) -> int:
+    """The level that a cell's x carries."""
+    return (x + _HALF_LEVEL) >> _LEVEL_BITS
+
+
+@wp.func
+def x_of_level(level: int) -> int:
+    """What a cell's x is greater by for its level."""
+    return level << _LEVEL_BITS
+
+
+@wp.func
 def cell_of(point: wp.vec3, radius: Radius) -> wp.vec3i:
     """The cell of a finite point."""
+    level = int(0)
+    inverse_side = radius.inverse_side
     if radius.per_metre > wp.float64(0.0):
         level = _level_of(_reach_at(point, radius) / radius.at_origin)
-        inverse_side = radius.inverse_side / _growth_of(level)
-        return wp.vec3i(
-            int(wp.floor(wp.float64(point[0]) * inverse_side)) + (level << _LEVEL_BITS),
-            int(wp.floor(wp.float64(point[1]) * inverse_side)),
-            int(wp.floor(wp.float64(point[2]) * inverse_side)),
-        )
-    return wp.vec3i(
-        _cell_along(point[0], radius.inverse_side),
-        _cell_along(point[1], radius.inverse_side),
-        _cell_along(point[2], radius.inverse_side),
-    )
+        inverse_side = inverse_side / _growth_of(level)
+    x = wp.float64(point[0]) * inverse_side
+    y = wp.float64(point[1]) * inverse_side
+    z = wp.float64(point[2]) * inverse_side
+    a = int(wp.floor(x))
+    b = int(wp.floor(y))
+    c = int(wp.floor(z))
+    if radius.per_metre > wp.float64(0.0):
+        a += level << _LEVEL_BITS
+    elif wp.max(wp.max(wp.abs(x), wp.abs(y)), wp.abs(z)) >= _LARGEST_CELL:
+        a = _cell_along(point[0], inverse_side)
+        b = _cell_along(point[1], inverse_side)
+        c = _cell_along(point[2], inverse_side)
+    return wp.vec3i(a, b, c)
 
 
 @wp.func
@@ -231,12 +250,19 @@ def _touch_large(
 def _touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
     if wp.int64(a_end - a_begin) * wp.int64(b_end - b_begin) > _BRUTE_FORCE:
         return _touch_large(points, a_begin, a_end, b_begin, b_end, radius)
-    for i in range(a_begin, a_end):
+    near = bool(False)
+    i = int(a_begin)
+    while i < a_end:
         p = points[i]
-        for j in range(b_begin, b_end):
+        j = int(b_begin)
+        while j < b_end:
             if is_near(p, points[j], radius):
-                return True
-    return False
+                near = True
+                j = b_end
+                i = a_end
+            j += 1
+        i += 1
+    return near
 
 
 @wp.func

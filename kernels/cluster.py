@@ -15,9 +15,10 @@ import numpy as np
 import warp as wp
 
 from .backend import uses_taichi
+from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
-from .cluster_columns import gather_cells_in_order, join_in_order, join_levels_in_order, label_in_order
+from .cluster_columns import join_borders, join_levels_in_order, join_own_columns, label_points
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -29,6 +30,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _SMALLEST_RADIUS = 1e-8
 _LEAST_GROWTH = 1e-5
+_LEAST_MAP, _MAP_PER_POINT = 1 << 20, 16  # places of the map of columns
 
 
 @wp.kernel
@@ -130,26 +132,31 @@ class EuclideanCluster:
         keep("_radius", radius_of(self.radius, self.radius_per_metre))
         keep("_sequential", sequential)
         keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
-        buffers(wp.int32, "labels", "_cell_end")
+        buffers(wp.int32, "labels")
         keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
         forward = [d for d in np.ndindex(5, 5, 5) if d > (2, 2, 2)]
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         if sequential:
-            flat = np.unique(offsets[:, :2], axis=0)
-            flat = flat[np.argsort((flat**2).sum(1), kind="stable")][1:]
-            slots = 2 << (self.capacity - 1).bit_length()
-            keep("_near_offsets", int((np.abs(flat).max(1) == 1).sum()))
-            keep("_offsets", wp.array(flat, dtype=wp.vec2i, device=device))
-            for name in ("_table", "_column_table"):
-                keep(name, wp.full(slots, -1, dtype=wp.int32, device=device))
-            buffers(wp.vec3, "_points")
-            buffers(wp.vec3i, "_cells")
-            buffers(wp.vec4i, "_columns")
-            buffers(wp.vec2i, "_stack")
-            buffers(wp.int32, "_cell_begin", "_parent", "_members", "_cell_of_point", "_cell_slot", "_cell_column")
-            buffers(wp.int32, "_column_slot", "_column_root")
-            keep("_sizes", wp.zeros(2, dtype=wp.int32, device=device))
+            by_cell = CellColumns(self._radius, self.capacity)
+            keep("_by_cell", by_cell)
+            cells = self.capacity + by_cell.parts
+            for name in ("_parent", "_members", "_column_root", "_places"):
+                keep(name, wp.empty(cells, dtype=wp.int32, device=device))
+            keep("_masks", wp.empty(self.capacity, dtype=wp.uint64, device=device))
+            if self.radius_per_metre > 0:
+                slots = 2 << (self.capacity - 1).bit_length()
+                keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
+                keep("_cells", wp.empty(cells, dtype=wp.vec3i, device=device))
+                for name in ("_slots", "_cell_begin", "_cell_end"):
+                    keep(name, wp.empty(cells, dtype=wp.int32, device=device))
+            # The adjacent columns first, and of them those that share a side.
+            flat = sorted({d[:2] for d in forward} - {(2, 2)}, key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
+            keep("_offsets", wp.array(np.array(flat, np.int32) - 2, dtype=wp.vec2i, device=device))
+            places = max(_LEAST_MAP, _MAP_PER_POINT * self.capacity)
+            keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=device))
+            keep("_root_map", wp.full(places, -2, dtype=wp.int32, device=device))
         else:
+            buffers(wp.int32, "_cell_end")
             keep("_offsets", wp.array(offsets, dtype=wp.vec3i, device=device))
             keep("_by_cell", CellTable(self._radius, self.capacity, device))
 
@@ -171,7 +178,7 @@ class EuclideanCluster:
                 raise ValueError(f"include must be bool or uint8 with at least {n} rows, as there are points")
             mask, has_include = include.view(wp.uint8) if include.dtype == wp.bool else include, 1
         if self._sequential:
-            self._launch_in_order(n, [xyz, count, mask, has_include, self._radius])
+            self._launch_in_order(n, [xyz, count, mask, has_include])
         elif n == 0:
             self.cluster_count.zero_()
         else:
@@ -179,41 +186,31 @@ class EuclideanCluster:
             self._launch_shared(n)
 
     def _launch_in_order(self, n: int, given: list) -> None:
-        tables = [self._table, self._column_table]
-        cell_ends = [self._cell_begin, self._cell_end]
+        by_cell, radius = self._by_cell, self._radius
+        columns = [by_cell.ranges, by_cell.columns]
+        by_cell.launch(*given)
+        cells = [by_cell.stacks, by_cell.points, radius]
+        by_cell.run(
+            join_own_columns,
+            [by_cell.layout, *columns, *cells, self._offsets],
+            [self._column_map, self._root_map, self._column_root, self._places, self._masks, self._parent],
+        )
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
             wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
 
-        run(
-            gather_cells_in_order,
-            given,
-            [
-                *(*tables, self._cell_of_point, self._cells, self._cell_slot, *cell_ends, self._cell_column),
-                *(self._columns, self._column_slot, self._parent, self._points, self._stack, self._sizes),
-            ],
-        )
-        run(
-            join_in_order,
-            [
-                *(self._column_table, self._columns, self._stack, *cell_ends, self._points, self._sizes),
-                *(self._offsets, self._near_offsets, self._radius),
-            ],
-            [self._parent, self._column_root],
-        )
+        if by_cell.parts > 1:
+            run(join_borders, [*columns, self._column_root, *cells], [self._parent])
         if self.radius_per_metre > 0:
             run(
                 join_levels_in_order,
-                [self._table, None, self._cells, *cell_ends, self._points, self._sizes, self._radius],
-                [self._parent],
+                [*columns, by_cell.stacks, by_cell.points, None, radius],
+                [self._table, self._parent, self._cells, self._slots, self._cell_begin, self._cell_end],
             )
         run(
-            label_in_order,
-            [
-                *(given[1], self._cell_of_point, self._cell_slot, *cell_ends, self._column_slot),
-                *(self._sizes, self._parent, self.min_size),
-            ],
-            [*tables, self._members, self.labels[:n], self.cluster_count],
+            label_points,
+            [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, self.min_size],
+            [self._parent, self._members, self.labels[:n], self.cluster_count],
         )
 
     def _launch_shared(self, n: int) -> None:

@@ -1,304 +1,541 @@
-"""Clustering by one thread: columns of cells, walked through with their neighbours. `cluster.py` has the plan."""
+"""Clustering on a CPU: columns of cells, walked through beside their neighbours. `cluster.py` has the plan.
+
+Each part of the work joins the cells of its own columns, in a forest that no other part reads; one thread then joins
+the columns at the borders between the parts, which are few.
+"""
 
 from __future__ import annotations
 
 import warp as wp
 
-from .cell_pairs import Radius, cell_of, differ, find, hash_cell, hash_column, is_finite, join_levels, touch
+from .cell_columns import Layout, row_of
+from .cell_pairs import Radius, find, hash_cell, join_levels, touch
 
-__all__ = ["gather_cells_in_order", "join_in_order", "join_levels_in_order", "label_in_order"]
+__all__ = ["join_borders", "join_levels_in_order", "join_own_columns", "label_points"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_FEW = wp.constant(16)  # cells of a column that an insertion sort takes
+_ADJACENT = wp.constant(0)  # which cells of two columns to unite: those that share a corner
+_OTHERS = wp.constant(1)
+_ALL = wp.constant(2)
+_UNNUMBERED = wp.constant(-2)
+_NO_COLUMN = wp.constant(-2)
+_NO_ROOT = wp.constant(-3)
+_HIGH_CELL = wp.constant(wp.uint64(1 << 60))
 
 
 @wp.func
-def _sort_by_height(stack: wp.array(dtype=wp.vec2i), begin: int, end: int):
-    """Shell sort, which for the few cells of most columns is an insertion sort."""
-    gap = int(1)
-    if end - begin > _FEW:
-        while gap < (end - begin) // 3:
-            gap = gap * 3 + 1
-    while gap > 0:
-        for i in range(begin + gap, end):
-            moving = stack[i]
-            place = int(i)
-            while place >= begin + gap and stack[place - gap][0] > moving[0]:
-                stack[place] = stack[place - gap]
-                place -= gap
-            stack[place] = moving
-        gap = gap // 3
-
-
-@wp.kernel
-def gather_cells_in_order(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    include_in: wp.array(dtype=wp.uint8),
-    has_include: int,
-    radius: Radius,
-    # in out: tables of cells and of columns, -1 where free
-    cell_table: wp.array(dtype=wp.int32),
-    column_table: wp.array(dtype=wp.int32),
-    # out
-    cell_of_point: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=wp.vec3i),
-    cell_slot: wp.array(dtype=wp.int32),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    cell_column: wp.array(dtype=wp.int32),
-    columns: wp.array(dtype=wp.vec4i),
-    column_slot: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
+def _join_cells(
+    a: int,
+    b: int,
+    stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
-    stack: wp.array(dtype=wp.vec2i),
-    sizes: wp.array(dtype=wp.int32),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
 ):
-    """Numbers cells by their lowest point, lists the points of each cell, and by height the cells of each column."""
-    cell_mask = cell_table.shape[0] - 1
-    column_mask = column_table.shape[0] - 1
-    cell_count = int(0)
-    column_count = int(0)
-    c = int(-1)
-    before = wp.vec3i(0, 0, 0)
-    n = wp.min(count_in[0], xyz_in.shape[0])
-    for i in range(n):
-        point = xyz_in[i]
-        usable = is_finite(point)
-        if usable and has_include != 0:
-            usable = include_in[i] != wp.uint8(0)
-        if usable:
-            cell = cell_of(point, radius)
-            # Neighbours in a scan are mostly neighbours in space: often it is the cell of the point before.
-            if c < 0 or differ(cell, before):
-                before = cell
-                slot = hash_cell(cell) & cell_mask
-                c = cell_table[slot]
-                while c >= 0 and differ(cells[c], cell):
-                    slot = (slot + 1) & cell_mask
-                    c = cell_table[slot]
-                if c < 0:
-                    c = cell_count
-                    cell_count += 1
-                    cell_table[slot] = c
-                    cell_slot[c] = slot
-                    cells[c] = cell
-                    cell_end[c] = 0
-                    parent[c] = c
-                    slot = hash_column(cell[0], cell[1]) & column_mask
-                    k = column_table[slot]
-                    while k >= 0 and (columns[k][0] != cell[0] or columns[k][1] != cell[1]):
-                        slot = (slot + 1) & column_mask
-                        k = column_table[slot]
-                    if k < 0:
-                        k = column_count
-                        column_count += 1
-                        column_table[slot] = k
-                        column_slot[k] = slot
-                        columns[k] = wp.vec4i(cell[0], cell[1], 0, 0)
-                    cell_column[c] = k
-                    columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
-            cell_of_point[i] = c
-            cell_end[c] = cell_end[c] + 1
-        else:
-            cell_of_point[i] = -1
-    # From sizes to where each begins; the end then moves as it is filled.
-    begin = int(0)
-    for k in range(column_count):
-        column = columns[k]
-        columns[k] = wp.vec4i(column[0], column[1], begin, begin)
-        begin += column[3]
-    begin = int(0)
-    for v in range(cell_count):
-        cell_begin[v] = begin
-        begin += cell_end[v]
-        cell_end[v] = cell_begin[v]
-        k = cell_column[v]
-        stack[columns[k][3]] = wp.vec2i(cells[v][2], v)
-        columns[k] = columns[k] + wp.vec4i(0, 0, 0, 1)
-    for i in range(n):
-        v = cell_of_point[i]
-        if v >= 0:
-            end = cell_end[v]
-            points[end] = xyz_in[i]
-            cell_end[v] = end + 1
-    for k in range(column_count):
-        _sort_by_height(stack, columns[k][2], columns[k][3])
-    sizes[0] = cell_count
-    sizes[1] = column_count
+    """Unites two cells if they touch."""
+    if parent[a] != parent[b]:
+        root_a = find(parent, a)
+        root_b = find(parent, b)
+        if root_a != root_b and touch(points, stacks[a][1], stacks[a + 1][1], stacks[b][1], stacks[b + 1][1], radius):
+            parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
 
 
 @wp.func
-def _join_stacks(
-    stack: wp.array(dtype=wp.vec2i),
+def _join_heights(
+    here: wp.vec4i,
+    there: wp.vec4i,
+    least: int,
+    most: int,
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites those cells of two columns that touch, of those whose z differ by `least` … `most`."""
+    low = int(there[2])
+    for a in range(here[2], here[3]):
+        z = stacks[a][0]
+        while low < there[3] and stacks[low][0] < z - most:
+            low += 1
+        b = int(low)
+        while b < there[3] and stacks[b][0] <= z + most:
+            if wp.abs(stacks[b][0] - z) >= least:
+                _join_cells(a, b, stacks, points, radius, parent)
+            b += 1
+
+
+@wp.func
+def _join_second_next(
+    column: wp.vec4i,
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites those cells of a column that touch, of those whose z differ by two."""
+    for a in range(column[2], column[3] - 1):
+        for b in range(a + 1, wp.min(a + 3, column[3])):
+            if stacks[b][0] == stacks[a][0] + 2:
+                _join_cells(a, b, stacks, points, radius, parent)
+
+
+@wp.func
+def _is_before(column: wp.vec4i, x: int, y: int) -> bool:
+    return column[0] < x or (column[0] == x and column[1] < y)
+
+
+@wp.func
+def _join_rows(
+    columns: wp.array(dtype=wp.vec4i),
+    first: int,
+    last: int,
+    others: int,
+    others_end: int,
+    dx: int,
+    least_dy: int,
+    most_dy: int,
+    which: int,
+    column_root: wp.array(dtype=wp.int32),
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites cells of columns with those of others that are `dx` rows on and `least_dy` … `most_dy` aside."""
+    head = int(others)
+    for k in range(first, last):
+        here = columns[k]
+        x = here[0] + dx
+        while head < others_end and _is_before(columns[head], x, here[1] + least_dy):
+            head += 1
+        other = int(head)
+        if others == first and other <= k:
+            other = k + 1
+        while other < others_end and columns[other][0] == x and columns[other][1] <= here[1] + most_dy:
+            there = columns[other]
+            if which == _ADJACENT:
+                _join_heights(here, there, 0, 0, stacks, points, radius, parent)
+                _join_heights(here, there, 1, 1, stacks, points, radius, parent)
+            elif column_root[k] < 0 or column_root[k] != column_root[other]:
+                least = int(0)
+                if which == _OTHERS and dx < 2 and wp.abs(there[1] - here[1]) < 2:
+                    least = 2
+                _join_heights(here, there, least, 2, stacks, points, radius, parent)
+            other += 1
+
+
+@wp.func
+def _aligned(mask: wp.uint64, by: int) -> wp.uint64:
+    """A mask moved by a number of heights; up to 63 of them, beyond which nothing is left."""
+    moved = wp.uint64(0)
+    if by >= 0 and by < 64:
+        moved = mask >> wp.uint64(by)
+    elif by < 0 and by > -64:
+        moved = mask << wp.uint64(-by)
+    return moved
+
+
+@wp.func
+def _join_two_columns(
+    here: wp.vec4i,
+    there: wp.vec4i,
+    here_mask: wp.uint64,
+    there_mask: wp.uint64,
+    first_step: int,
+    last_step: int,
+    whole: bool,
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites those cells of two columns that touch, of those whose z differ by 0, 1, -1, 2, -2: the steps.
+
+    If both columns are `whole`, of one component each, the first two cells that touch are enough.
+    """
+    a_begin = here[2]
+    b_begin = there[2]
+    apart = stacks[a_begin][0] - stacks[b_begin][0]
+    one = wp.uint64(1)
+    step = int(first_step)
+    # Where no cell is within two of another there is nothing to try.
+    spread = here_mask | (here_mask << one)
+    spread = spread | (spread << wp.uint64(2)) | (here_mask << wp.uint64(4))
+    if here_mask < _HIGH_CELL and (spread & _aligned(there_mask, apart - 2)) == wp.uint64(0):
+        step = 5
+    while step <= last_step:
+        by = (step + 1) >> 1
+        if (step & 1) == 0:
+            by = -by
+        by += apart
+        left = here_mask & _aligned(there_mask, by)
+        while left != wp.uint64(0):
+            lower = (left & (~left + one)) - one  # ones below the lowest one
+            height = int(wp.bit_count(lower))
+            a = a_begin + int(wp.bit_count(here_mask & lower))
+            b = b_begin + int(wp.bit_count(there_mask & ((one << wp.uint64(height + by)) - one)))
+            left = left & (left - one)
+            _join_cells(a, b, stacks, points, radius, parent)
+            if whole and parent[a] == parent[b]:
+                left = wp.uint64(0)
+                step = last_step
+        step += 1
+
+
+@wp.func
+def _bit_if_other(root: int, own: int, bit: int) -> int:
+    """A one at a bit, if there is a column at all and it is not of the same component."""
+    bits = int(0)
+    if root != _NO_COLUMN and root != own:
+        bits = 1 << bit
+    return bits
+
+
+@wp.func
+def _bit_if_any(column: int, bit: int) -> int:
+    bits = int(0)
+    if column >= 0:
+        bits = 1 << bit
+    return bits
+
+
+@wp.func
+def _join_neighbours(
+    k: int,
+    neighbours: int,
+    ring: int,
     begin: int,
     end: int,
-    other_begin: int,
-    other_end: int,
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
+    row_length: int,
+    offsets: wp.array(dtype=wp.vec2i),
+    column_map: wp.array(dtype=wp.int32),
+    places: wp.array(dtype=wp.int32),
+    columns: wp.array(dtype=wp.vec4i),
+    column_root: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.uint64),
+    stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
     radius: Radius,
     parent: wp.array(dtype=wp.int32),
 ):
-    """Unites the cells of two columns that touch; of a column and itself, where the two begin alike."""
-    low = int(other_begin)
-    for s in range(begin, end):
-        z = stack[s][0]
-        a = stack[s][1]
-        if begin == other_begin:
-            low = s + 1
-        while low < other_end and stack[low][0] < z - 2:
-            low += 1
-        t = int(low)
-        while t < other_end and stack[t][0] <= z + 2:
-            b = stack[t][1]
-            if parent[a] != parent[b]:
-                root_a = find(parent, a)
-                root_b = find(parent, b)
-                if root_a != root_b and touch(points, cell_begin[a], cell_end[a], cell_begin[b], cell_end[b], radius):
-                    parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
-            t += 1
+    """Unites cells of a column with those of its neighbours, a bit each, that touch, of ring 0 or 1."""
+    here = columns[k]
+    here_mask = masks[k]
+    root = column_root[k]
+    left = int(neighbours)
+    while left != 0:
+        o = wp.bit_count((left & -left) - 1)
+        left = left & (left - 1)
+        other = column_map[places[k] + offsets[o][0] * row_length + offsets[o][1]]
+        if other >= begin and other < end:
+            there_root = column_root[other]
+            whole = root >= 0 and there_root >= 0
+            if not whole or find(parent, root) != find(parent, there_root):
+                there = columns[other]
+                there_mask = masks[other]
+                first_step = int(0)
+                last_step = int(2)
+                if ring == 1:
+                    last_step = 4
+                    if o < 4:
+                        first_step = 3
+                if here_mask == wp.uint64(0) or there_mask == wp.uint64(0):
+                    _join_heights(here, there, first_step >> 1, last_step >> 1, stacks, points, radius, parent)
+                else:
+                    _join_two_columns(
+                        here,
+                        there,
+                        here_mask,
+                        there_mask,
+                        first_step,
+                        last_step,
+                        whole,
+                        stacks,
+                        points,
+                        radius,
+                        parent,
+                    )
 
 
 @wp.kernel
-def join_in_order(
+def join_own_columns(
+    part: int,
+    parts: int,
     # in
-    column_table: wp.array(dtype=wp.int32),
+    layout_in: wp.array(dtype=Layout),
+    ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
-    stack: wp.array(dtype=wp.vec2i),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
+    stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=wp.int32),
-    offsets: wp.array(dtype=wp.vec2i),
-    near_offsets: int,
     radius: Radius,
-    # in out: roots of columns that are of one component, else -1
-    parent: wp.array(dtype=wp.int32),
+    offsets: wp.array(dtype=wp.vec2i),
+    # in out: a map of columns and one of their roots, no column where there is none, and left so
+    column_map: wp.array(dtype=wp.int32),
+    root_map: wp.array(dtype=wp.int32),
+    # out: roots of columns that are of one component, else -1; their places on the map; their cells' heights above
+    # the lowest as a mask, 0 where it is not wide enough
     column_root: wp.array(dtype=wp.int32),
+    places: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.uint64),
+    parent: wp.array(dtype=wp.int32),
 ):
-    """Unites cells of a column and of neighbouring columns, the adjacent first: they leave little to the others."""
-    mask = column_table.shape[0] - 1
-    for k in range(sizes[1]):
-        column_root[k] = -1
-        begin = columns[k][2]
-        end = columns[k][3]
-        _join_stacks(stack, begin, end, begin, end, cell_begin, cell_end, points, radius, parent)
-    for ring in range(2):
-        first = int(0)
-        last = int(near_offsets)
+    """Unites the cells of a part that touch, the adjacent first: they leave little to the others."""
+    layout = layout_in[0]
+    begin = ranges[part][2]
+    end = ranges[part][3]
+    # Two columns free on either side, so that no neighbour is in the next row.
+    row_length = layout.depth + 4
+    rows = layout.levels * (layout.width + 2)
+    mapped = layout.high_digits > 0 and rows <= column_map.shape[0] // row_length
+    # Adjacent cells of a column.
+    k = begin
+    while k < end:
+        column = columns[k]
+        a = column[2]
+        last = column[3] - 1
+        parent[a] = a
+        z = stacks[a][0]
+        lowest = z
+        mask = wp.uint64(1)
+        root = a
+        while a < last:
+            above = stacks[a + 1][0]
+            a += 1
+            if above == z + 1 and touch(points, stacks[a - 1][1], stacks[a][1], stacks[a][1], stacks[a + 1][1], radius):
+                parent[a] = parent[a - 1]
+            else:
+                parent[a] = a
+                root = -1
+            z = above
+            mask = mask | (wp.uint64(1) << wp.uint64((z - lowest) & 63))
+        if z - lowest > 63:
+            mask = wp.uint64(0)
+        masks[k] = mask
+        column_root[k] = root
+        if mapped:
+            place = row_of(column[0], layout, 2) * row_length + column[1] - layout.least[1] + 2
+            places[k] = place
+            column_map[place] = k
+        k += 1
+    # Adjacent cells of adjacent columns, then all others. One loop for both, so that what it calls is compiled in once.
+    ring = int(0)
+    while ring < 2:
         if ring == 1:
-            first = near_offsets
-            last = offsets.shape[0]
-        for k in range(sizes[1]):
-            here = columns[k]
-            root = column_root[k]
-            for o in range(first, last):
-                x = here[0] + offsets[o][0]
-                y = here[1] + offsets[o][1]
-                slot = hash_column(x, y) & mask
-                other = column_table[slot]
-                while other >= 0:
-                    there = columns[other]
-                    if there[0] == x and there[1] == y:
-                        if root < 0 or column_root[other] != root:
-                            _join_stacks(
-                                stack,
-                                here[2],
-                                here[3],
-                                there[2],
-                                there[3],
-                                cell_begin,
-                                cell_end,
-                                points,
-                                radius,
-                                parent,
-                            )
-                        other = -1
-                    else:
-                        slot = (slot + 1) & mask
-                        other = column_table[slot]
-        for c in range(sizes[0]):
-            parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
-        if ring == 0:
-            for k in range(sizes[1]):
-                begin = columns[k][2]
-                root = parent[stack[begin][1]]
-                for s in range(begin + 1, columns[k][3]):
-                    if parent[stack[s][1]] != root:
+            c = ranges[part][0]
+            while c < ranges[part][1]:
+                parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
+                c += 1
+            k = begin
+            while k < end:
+                a = columns[k][2]
+                last = columns[k][3] - 1
+                root = parent[a]
+                while a < last:
+                    a += 1
+                    if parent[a] != root:
                         root = -1
                 column_root[k] = root
+                if mapped:
+                    root_map[places[k]] = root
+                if root < 0:
+                    _join_second_next(columns[k], stacks, points, radius, parent)
+                k += 1
+        k = begin
+        while mapped and k < end:
+            at = places[k]
+            next = at + row_length
+            neighbours = int(0)
+            if ring == 0:
+                neighbours = _bit_if_any(column_map[at + 1], 0) | _bit_if_any(column_map[next], 1)
+                neighbours = neighbours | _bit_if_any(column_map[next - 1], 2) | _bit_if_any(column_map[next + 1], 3)
+            else:
+                own = column_root[k]
+                if own < 0:
+                    own = _NO_ROOT
+                second = next + row_length
+                neighbours = _bit_if_other(root_map[at + 1], own, 0) | _bit_if_other(root_map[next], own, 1)
+                neighbours = neighbours | _bit_if_other(root_map[next - 1], own, 2)
+                neighbours = neighbours | _bit_if_other(root_map[next + 1], own, 3)
+                neighbours = neighbours | _bit_if_other(root_map[at + 2], own, 4)
+                neighbours = neighbours | _bit_if_other(root_map[second], own, 5)
+                neighbours = neighbours | _bit_if_other(root_map[next - 2], own, 6)
+                neighbours = neighbours | _bit_if_other(root_map[next + 2], own, 7)
+                neighbours = neighbours | _bit_if_other(root_map[second - 1], own, 8)
+                neighbours = neighbours | _bit_if_other(root_map[second + 1], own, 9)
+                neighbours = neighbours | _bit_if_other(root_map[second - 2], own, 10)
+                neighbours = neighbours | _bit_if_other(root_map[second + 2], own, 11)
+            if neighbours != 0:
+                _join_neighbours(
+                    k,
+                    neighbours,
+                    ring,
+                    begin,
+                    end,
+                    row_length,
+                    offsets,
+                    column_map,
+                    places,
+                    columns,
+                    column_root,
+                    masks,
+                    stacks,
+                    points,
+                    radius,
+                    parent,
+                )
+            k += 1
+        if not mapped:
+            dx = int(0)
+            while dx < 2 + ring:
+                _join_rows(
+                    columns,
+                    begin,
+                    end,
+                    begin,
+                    end,
+                    dx,
+                    -1 - ring,
+                    1 + ring,
+                    ring,
+                    column_root,
+                    stacks,
+                    points,
+                    radius,
+                    parent,
+                )
+                dx += 1
+        ring += 1
+    k = begin
+    while mapped and k < end:
+        column_map[places[k]] = -1
+        root_map[places[k]] = _NO_COLUMN
+        k += 1
+
+
+@wp.kernel
+def join_borders(
+    # in
+    ranges: wp.array(dtype=wp.vec4i),
+    columns: wp.array(dtype=wp.vec4i),
+    column_root: wp.array(dtype=wp.int32),
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+    # in out
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites cells of different parts that touch."""
+    parts = ranges.shape[0]
+    for p in range(parts):
+        for q in range(p + 1, parts):
+            begin = ranges[q][2]
+            end = ranges[q][3]
+            if begin < end:
+                x = columns[begin][0] - 2
+                y = columns[begin][1] - 2
+                last = ranges[p][3]
+                first = int(last)
+                while first > ranges[p][2] and not _is_before(columns[first - 1], x, y):
+                    first -= 1
+                for dx in range(3):
+                    _join_rows(
+                        columns, first, last, begin, end, dx, -2, 2, _ALL, column_root, stacks, points, radius, parent
+                    )
 
 
 @wp.kernel
 def join_levels_in_order(
-    # in: of slots nothing, since the table has the cells themselves
-    cell_table: wp.array(dtype=wp.int32),
+    # in
+    ranges: wp.array(dtype=wp.vec4i),
+    columns: wp.array(dtype=wp.vec4i),
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
     no_slots: wp.array(dtype=wp.int32),
+    radius: Radius,
+    # in out: a table of cells, -1 where free, and left so; components
+    table: wp.array(dtype=wp.int32),
+    parent: wp.array(dtype=wp.int32),
+    # out
     cells: wp.array(dtype=wp.vec3i),
+    slots: wp.array(dtype=wp.int32),
     cell_begin: wp.array(dtype=wp.int32),
     cell_end: wp.array(dtype=wp.int32),
-    points: wp.array(dtype=wp.vec3),
-    sizes: wp.array(dtype=wp.int32),
-    radius: Radius,
-    # in out: roots
-    parent: wp.array(dtype=wp.int32),
 ):
     """Unites cells of different levels that touch."""
-    for a in range(sizes[0]):
-        join_levels(a, cell_table, no_slots, cells, cell_begin, cell_end, points, radius, parent)
-    for c in range(sizes[0]):
-        parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
+    mask = table.shape[0] - 1
+    for p in range(ranges.shape[0]):
+        for k in range(ranges[p][2], ranges[p][3]):
+            column = columns[k]
+            for c in range(column[2], column[3]):
+                cell = wp.vec3i(column[0], column[1], stacks[c][0])
+                slot = hash_cell(cell) & mask
+                while table[slot] >= 0:
+                    slot = (slot + 1) & mask
+                table[slot] = c
+                slots[c] = slot
+                cells[c] = cell
+                cell_begin[c] = stacks[c][1]
+                cell_end[c] = stacks[c + 1][1]
+    for p in range(ranges.shape[0]):
+        for c in range(ranges[p][0], ranges[p][1]):
+            join_levels(c, table, no_slots, cells, cell_begin, cell_end, points, radius, parent)
+    for p in range(ranges.shape[0]):
+        for c in range(ranges[p][0], ranges[p][1]):
+            table[slots[c]] = -1
 
 
 @wp.kernel
-def label_in_order(
+def label_points(
     # in
-    count_in: wp.array(dtype=wp.int32),
+    ranges: wp.array(dtype=wp.vec4i),
+    stacks: wp.array(dtype=wp.vec2i),
     cell_of_point: wp.array(dtype=wp.int32),
-    cell_slot: wp.array(dtype=wp.int32),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-    column_slot: wp.array(dtype=wp.int32),
-    sizes: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
     min_size: int,
-    # in out: tables left free; members left as labels
-    cell_table: wp.array(dtype=wp.int32),
-    column_table: wp.array(dtype=wp.int32),
+    # in out: members left as labels
+    parent: wp.array(dtype=wp.int32),
     members: wp.array(dtype=wp.int32),
     # out
     labels_out: wp.array(dtype=wp.int32),
     cluster_count_out: wp.array(dtype=wp.int32),
 ):
-    """Counts each component's points, numbers those with enough, and hands the numbers to the points."""
-    for c in range(sizes[0]):
-        cell_table[cell_slot[c]] = -1
-        root = parent[c]
-        if root == c:
-            members[c] = 0
-        members[root] = members[root] + cell_end[c] - cell_begin[c]
-    for k in range(sizes[1]):
-        column_table[column_slot[k]] = -1
+    """Counts each component's points, numbers those with enough in the order of their first, and labels the points."""
+    for p in range(ranges.shape[0]):
+        c = ranges[p][0]
+        end = ranges[p][1]
+        while c < end:
+            root = parent[parent[c]]  # the parent of a lower cell is its root by now
+            parent[c] = root
+            before = int(0)
+            if root != c:
+                before = members[root]
+            members[root] = before + stacks[c + 1][1] - stacks[c][1]
+            c += 1
+    for p in range(ranges.shape[0]):
+        c = ranges[p][0]
+        end = ranges[p][1]
+        while c < end:
+            if parent[c] == c:
+                # Of a root nothing but its label is wanted from here on.
+                label = int(-1)
+                if members[c] >= min_size:
+                    label = _UNNUMBERED
+                members[c] = label
+            c += 1
     clusters = int(0)
-    for c in range(sizes[0]):
-        root = parent[c]
-        if root == c:
-            # Of a root nothing but its label is wanted from here on.
-            label = int(-1)
-            if members[c] >= min_size:
-                label = clusters
-                clusters += 1
-            members[c] = label
-        else:
-            members[c] = members[root]
-    for i in range(labels_out.shape[0]):
+    n = labels_out.shape[0]
+    i = int(0)
+    while i < n:
         label = int(-1)
-        if i < count_in[0] and cell_of_point[i] >= 0:
-            label = members[cell_of_point[i]]
+        c = cell_of_point[i]
+        if c >= 0:
+            root = parent[c]
+            label = members[root]
+            if label == _UNNUMBERED:
+                label = clusters
+                members[root] = label
+                clusters += 1
         labels_out[i] = label
+        i += 1
     cluster_count_out[0] = clusters

@@ -1,0 +1,488 @@
+"""A cloud's points by cell, for a CPU: sorted by x, y and z, so that cells stand in columns and columns in rows.
+
+Two passes of a counting sort do it, on all cores: each part of the work counts and moves a share of the points. The
+digits are made to measure from the extent of the cloud. A cloud too wide for two digits, such as one with a point a
+thousand kilometres away, is sorted along each axis by as many passes as it takes, on one core.
+
+From there on each part has the cells of a range of columns to itself. See `cell_pairs.py` for what a cell is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+from .cell_pairs import Radius, cell_of, is_finite, level_of_x, x_of_level
+from .device import DEFAULT_DEVICE
+from .threads import launch_parts, thread_count
+
+__all__ = ["CellColumns", "Layout", "parts_for", "row_of"]
+
+# Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
+wp.set_module_options({"fuse_fp": False})
+
+_NOWHERE = wp.constant(wp.int32(-(2**31)))  # x of the cell of points that are left out
+_LEAST = wp.constant(wp.int32(-(2**31)))
+_MOST = wp.constant(wp.int32(2**31 - 1))
+_MOST_CELLS = wp.constant(wp.int64(2**31 - 1))
+_WIDE_BITS = wp.constant(11)  # of a digit of clouds too wide for two digits made to measure
+_WIDE_DIGITS = wp.constant(1 << 11)
+_POINTS_WORTH_A_THREAD = 6_000
+
+
+@wp.struct
+class Layout:
+    """How the cells of a cloud are numbered: by column, and within a column by z."""
+
+    least: wp.vec4i  # the lowest x, y, z and level
+    has_levels: int
+    levels: int
+    width: int  # cells along x, in each level
+    depth: int  # along y
+    height: int  # along z
+    shift: int  # bits of a column's number that are of the low digit
+    low_digits: int
+    high_digits: int  # 0 where the cloud is too wide for two digits
+
+
+@wp.func
+def row_of(x: int, layout: Layout, aside: int) -> int:
+    """A column's row, of which each level has those of its cells and a number aside."""
+    level = int(0)
+    if layout.has_levels != 0:
+        level = level_of_x(x)
+    return (level - layout.least[3]) * (layout.width + aside) + x - x_of_level(level) - layout.least[0]
+
+
+@wp.func
+def _layout_of(bounds: wp.array(dtype=wp.vec4i), parts: int, has_levels: int, most_digits: int) -> Layout:
+    least = bounds[0]
+    most = bounds[1]
+    for part in range(1, parts):
+        least = wp.min(least, bounds[2 * part])
+        most = wp.max(most, bounds[2 * part + 1])
+    layout = Layout()
+    layout.least = least
+    layout.has_levels = has_levels
+    layout.levels = 1
+    layout.width = 1
+    layout.depth = 1
+    layout.height = 1
+    layout.low_digits = 1
+    layout.high_digits = 1
+    if least[0] > most[0]:
+        return layout
+    cells = wp.int64(1)
+    for axis in range(4):
+        extent = wp.int64(most[axis]) - wp.int64(least[axis]) + wp.int64(1)
+        if extent > _MOST_CELLS / cells:
+            layout.high_digits = 0
+            return layout
+        cells *= extent
+    layout.width = most[0] - least[0] + 1
+    layout.depth = most[1] - least[1] + 1
+    layout.height = most[2] - least[2] + 1
+    layout.levels = most[3] - least[3] + 1
+    columns = layout.levels * layout.width * layout.depth
+    while (layout.height << (layout.shift + 1)) <= (columns >> (layout.shift + 1)):
+        layout.shift += 1
+    layout.low_digits = layout.height << layout.shift
+    layout.high_digits = ((columns - 1) >> layout.shift) + 1
+    if layout.low_digits > most_digits or layout.high_digits > most_digits:
+        layout.high_digits = 0
+    return layout
+
+
+@wp.kernel
+def _find_cells(
+    part: int,
+    parts: int,
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    include_in: wp.array(dtype=wp.uint8),
+    has_include: int,
+    radius: Radius,
+    # out: of each part the lowest and the highest x, y, z and level; how many points there are to label
+    cells_out: wp.array(dtype=wp.vec3i),
+    cell_of_point: wp.array(dtype=wp.int32),
+    bounds_out: wp.array(dtype=wp.vec4i),
+    point_count_out: wp.array(dtype=wp.int32),
+):
+    """Finds the cell of each point, and their extent."""
+    n = xyz_in.shape[0]
+    used = wp.min(count_in[0], n)
+    low_x = int(_MOST)
+    low_y = int(_MOST)
+    low_z = int(_MOST)
+    low_level = int(_MOST)
+    high_x = int(_LEAST)
+    high_y = int(_LEAST)
+    high_z = int(_LEAST)
+    high_level = int(_LEAST)
+    i = n * part // parts
+    end = n * (part + 1) // parts
+    while i < end:
+        point = xyz_in[i]
+        usable = i < used and is_finite(point)
+        if usable and has_include != 0:
+            usable = include_in[i] != wp.uint8(0)
+        if usable:
+            cell = cell_of(point, radius)
+            cells_out[i] = cell
+            x = cell[0]
+            level = int(0)
+            if radius.per_metre > wp.float64(0.0):
+                level = level_of_x(x)
+                x -= x_of_level(level)
+            low_x = wp.min(low_x, x)
+            low_y = wp.min(low_y, cell[1])
+            low_z = wp.min(low_z, cell[2])
+            low_level = wp.min(low_level, level)
+            high_x = wp.max(high_x, x)
+            high_y = wp.max(high_y, cell[1])
+            high_z = wp.max(high_z, cell[2])
+            high_level = wp.max(high_level, level)
+        else:
+            cells_out[i] = wp.vec3i(_NOWHERE, 0, 0)
+            cell_of_point[i] = -1
+        i += 1
+    bounds_out[2 * part] = wp.vec4i(low_x, low_y, low_z, low_level)
+    bounds_out[2 * part + 1] = wp.vec4i(high_x, high_y, high_z, high_level)
+    if part == 0:
+        point_count_out[0] = n
+
+
+@wp.kernel
+def _count_digits(
+    part: int,
+    parts: int,
+    # in
+    cells: wp.array(dtype=wp.vec3i),
+    bounds: wp.array(dtype=wp.vec4i),
+    point_count: wp.array(dtype=wp.int32),
+    has_levels: int,
+    # out: a low and a high digit per point, of points that are left out -1; of each part how many have which digit
+    digits_out: wp.array(dtype=wp.vec2i),
+    low_counts: wp.array2d(dtype=wp.int32),
+    high_counts: wp.array2d(dtype=wp.int32),
+):
+    """Makes the two digits of each point, and counts them."""
+    layout = _layout_of(bounds, parts, has_levels, low_counts.shape[1])
+    if layout.high_digits == 0:
+        return
+    n = point_count[0]
+    low_count = low_counts[part]
+    high_count = high_counts[part]
+    for digit in range(layout.low_digits):
+        low_count[digit] = 0
+    for digit in range(layout.high_digits):
+        high_count[digit] = 0
+    mask = (1 << layout.shift) - 1
+    least_y = layout.least[1]
+    least_z = layout.least[2]
+    i = n * part // parts
+    end = n * (part + 1) // parts
+    while i < end:
+        cell = cells[i]
+        low = int(-1)
+        high = int(-1)
+        if cell[0] != _NOWHERE:
+            column = row_of(cell[0], layout, 0) * layout.depth + cell[1] - least_y
+            low = (column & mask) * layout.height + cell[2] - least_z
+            high = column >> layout.shift
+            low_count[low] = low_count[low] + 1
+            high_count[high] = high_count[high] + 1
+        digits_out[i] = wp.vec2i(low, high)
+        i += 1
+
+
+@wp.func
+def _sort_wide(
+    cells: wp.array(dtype=wp.vec3i),
+    least: wp.vec4i,
+    n: int,
+    count: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    spare: wp.array(dtype=wp.vec2i),
+) -> int:
+    """Sorts by z, y, x with as many digits as there are; gives how many points take part."""
+    used = int(0)
+    low = wp.vec3i(_MOST, least[1], least[2])
+    high = wp.vec3i(_LEAST, _LEAST, _LEAST)
+    for i in range(n):
+        if cells[i][0] != _NOWHERE:
+            order[used] = i
+            used += 1
+            low[0] = wp.min(low[0], cells[i][0])
+            high = wp.max(high, cells[i])
+    for pass_ in range(3):
+        axis = 2 - pass_
+        extent = wp.uint32(high[axis]) - wp.uint32(low[axis])
+        shift = int(0)
+        while shift < 32 and (extent >> wp.uint32(shift)) > wp.uint32(0):
+            for digit in range(_WIDE_DIGITS):
+                count[digit] = 0
+            for k in range(used):
+                i = order[k]
+                spare[k] = wp.vec2i(
+                    int((wp.uint32(cells[i][axis]) - wp.uint32(low[axis])) >> wp.uint32(shift)) & (_WIDE_DIGITS - 1), i
+                )
+                count[spare[k][0]] = count[spare[k][0]] + 1
+            begin = int(0)
+            for digit in range(_WIDE_DIGITS):
+                size = count[digit]
+                count[digit] = begin
+                begin += size
+            for k in range(used):
+                digit = spare[k][0]
+                order[count[digit]] = spare[k][1]
+                count[digit] = count[digit] + 1
+            shift += _WIDE_BITS
+    return used
+
+
+@wp.kernel
+def _sort_low(
+    part: int,
+    parts: int,
+    # in
+    cells: wp.array(dtype=wp.vec3i),
+    bounds: wp.array(dtype=wp.vec4i),
+    point_count: wp.array(dtype=wp.int32),
+    has_levels: int,
+    digits: wp.array(dtype=wp.vec2i),
+    low_counts: wp.array2d(dtype=wp.int32),
+    # out: where a part puts the next point of each digit; points by their low digit, each with its high one; of a
+    # wide cloud the order
+    next_place: wp.array2d(dtype=wp.int32),
+    by_low: wp.array(dtype=wp.vec2i),
+    order: wp.array(dtype=wp.int32),
+    used_out: wp.array(dtype=wp.int32),
+    layout_out: wp.array(dtype=Layout),
+):
+    """Sorts by the low digit. Of a cloud too wide for two digits the first part does the whole sort."""
+    layout = _layout_of(bounds, parts, has_levels, low_counts.shape[1])
+    n = point_count[0]
+    if part == 0:
+        layout_out[0] = layout
+    if layout.high_digits == 0:
+        if part == 0:
+            used_out[0] = _sort_wide(cells, layout.least, n, next_place[0], order, by_low)
+        return
+    place = next_place[part]
+    begin = int(0)
+    for digit in range(layout.low_digits):
+        for other in range(parts):
+            if other == part:
+                place[digit] = begin
+            begin += low_counts[other, digit]
+    if part == 0:
+        used_out[0] = begin
+    i = n * part // parts
+    end = n * (part + 1) // parts
+    while i < end:
+        both = digits[i]
+        if both[0] >= 0:
+            at = place[both[0]]
+            place[both[0]] = at + 1
+            by_low[at] = wp.vec2i(both[1], i)
+        i += 1
+
+
+@wp.func
+def _column_begin(order: wp.array(dtype=wp.int32), cells: wp.array(dtype=wp.vec3i), used: int, near: int) -> int:
+    """The first place at or after `near` where a column begins."""
+    begin = int(near)
+    while begin > 0 and begin < used:
+        here = cells[order[begin]]
+        before = cells[order[begin - 1]]
+        if here[0] != before[0] or here[1] != before[1]:
+            return begin
+        begin += 1
+    return begin
+
+
+@wp.kernel
+def _sort_high(
+    part: int,
+    parts: int,
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.vec3i),
+    layout_in: wp.array(dtype=Layout),
+    used_in: wp.array(dtype=wp.int32),
+    high_counts: wp.array2d(dtype=wp.int32),
+    by_low: wp.array(dtype=wp.vec2i),
+    # out
+    next_place: wp.array2d(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    cell_of_point: wp.array(dtype=wp.int32),
+    sorted_cells: wp.array(dtype=wp.vec3i),
+    points: wp.array(dtype=wp.vec3),
+    stacks: wp.array(dtype=wp.vec2i),
+    columns: wp.array(dtype=wp.vec4i),
+    ranges: wp.array(dtype=wp.vec4i),
+):
+    """Sorts a range of high digits, which is a range of columns, and lists their cells."""
+    layout = layout_in[0]
+    used = used_in[0]
+    begin = int(0)
+    end = int(0)
+    if layout.high_digits == 0:
+        begin = _column_begin(order, cells, used, used * part // parts)
+        end = _column_begin(order, cells, used, used * (part + 1) // parts)
+    else:
+        place = next_place[part]
+        first = int(_MOST)
+        last = int(-1)
+        at = int(0)
+        # A digit is of the part in whose share of the points it begins.
+        least = used * part // parts
+        most = used * (part + 1) // parts
+        for digit in range(layout.high_digits):
+            size = int(0)
+            for other in range(parts):
+                size += high_counts[other, digit]
+            if at >= least and at < most and size > 0:
+                if last < 0:
+                    first = digit
+                    begin = at
+                last = digit
+                end = at + size
+                place[digit] = at
+            at += size
+        k = int(0)
+        while k < used:
+            entry = by_low[k]
+            if entry[0] >= first and entry[0] <= last:
+                at = place[entry[0]]
+                place[entry[0]] = at + 1
+                order[at] = entry[1]
+            k += 1
+    # Each part leaves a place free after its cells, for where the last one ends.
+    c = begin + part - 1
+    k = begin - 1
+    x = int(_NOWHERE)
+    y = int(0)
+    z = int(0)
+    column_begin = int(0)
+    at = begin
+    # Without a branch the processor has many of these on their way at once.
+    while at < end:
+        i = order[at]
+        points[at] = xyz_in[i]
+        sorted_cells[at] = cells[i]
+        at += 1
+    at = begin
+    while at < end:
+        cell = sorted_cells[at]
+        if cell[0] != x or cell[1] != y:
+            if k >= begin:
+                columns[k] = wp.vec4i(x, y, column_begin, c + 1)
+            k += 1
+            c += 1
+            x = cell[0]
+            y = cell[1]
+            z = cell[2]
+            column_begin = c
+            stacks[c] = wp.vec2i(z, at)
+        elif cell[2] != z:
+            c += 1
+            z = cell[2]
+            stacks[c] = wp.vec2i(z, at)
+        cell_of_point[order[at]] = c
+        at += 1
+    if end > begin:
+        columns[k] = wp.vec4i(x, y, column_begin, c + 1)
+        stacks[c + 1] = wp.vec2i(0, end)
+    ranges[part] = wp.vec4i(begin + part, c + 1, begin, k + 1)
+
+
+def parts_for(capacity: int) -> int:
+    """Into how many parts the work on clouds of up to `capacity` points is cut."""
+    return max(1, min(thread_count(), capacity // _POINTS_WORTH_A_THREAD))
+
+
+class CellColumns:
+    """Workspace to sort clouds of up to `capacity` points into columns of cells; what is in it is for kernels."""
+
+    def __init__(self, radius: Radius, capacity: int, parts: int | None = None):
+        """Makes it.
+
+        Args:
+            radius: What the side of the cells follows from.
+            capacity: Points that one launch can take.
+            parts: Into how many the work is cut; by default as `parts_for` says.
+        """
+        self.parts = parts_for(capacity) if parts is None else parts
+        digits = 1 << min(16, max(13, capacity.bit_length()))
+
+        def buffer(shape: int | tuple[int, int] = capacity, dtype: type = wp.int32) -> wp.array:
+            return wp.empty(shape, dtype=dtype, device=DEFAULT_DEVICE)
+
+        self.radius = radius
+        self.point_count = wp.zeros(1, dtype=wp.int32, device=DEFAULT_DEVICE)
+        """Rows of the cloud, whether they take part or not."""
+        self.cells = buffer(dtype=wp.vec3i)
+        """Of each point; x is the lowest int32 for points that are left out."""
+        self.order = buffer()
+        """The points' indices by cell, in each cell in their own order."""
+        self.points = buffer(dtype=wp.vec3)
+        """The points in this order."""
+        self.cell_of_point = buffer()
+        """The number of each point's cell, or -1 for points that are left out."""
+        self.stacks = buffer(capacity + self.parts, wp.vec2i)
+        """Of each cell its z, and where its points begin; they end where those of the next begin."""
+        self.columns = buffer(dtype=wp.vec4i)
+        """Of each column x, y, its first cell, and the one after its last."""
+        self.ranges = wp.zeros(self.parts, dtype=wp.vec4i, device=DEFAULT_DEVICE)
+        """Of each part its first cell, the one after its last, its first column, and the one after its last."""
+        self.layout = wp.empty(1, dtype=Layout, device=DEFAULT_DEVICE)
+        self._bounds = buffer(2 * self.parts, wp.vec4i)
+        self._sorted_cells = buffer(dtype=wp.vec3i)
+        self._digits = buffer(dtype=wp.vec2i)
+        self._by_low = buffer(dtype=wp.vec2i)
+        self._low_counts, self._high_counts, self._next_place = (buffer((self.parts, digits)) for _ in range(3))
+        self._used = wp.zeros(1, dtype=wp.int32, device=DEFAULT_DEVICE)
+
+    def run(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        """Launches a kernel once per part."""
+        launch_parts(kernel, self.parts, inputs, outputs)
+
+    def launch(self, xyz: wp.array, count: wp.array, include: wp.array, has_include: int) -> None:
+        """Fills everything."""
+        has_levels = int(self.radius.per_metre > 0)
+        self.run(
+            _find_cells,
+            [xyz, count, include, has_include, self.radius],
+            [self.cells, self.cell_of_point, self._bounds, self.point_count],
+        )
+        self.run(
+            _count_digits,
+            [self.cells, self._bounds, self.point_count, has_levels],
+            [self._digits, self._low_counts, self._high_counts],
+        )
+        self.run(
+            _sort_low,
+            [self.cells, self._bounds, self.point_count, has_levels, self._digits, self._low_counts],
+            [self._next_place, self._by_low, self.order, self._used, self.layout],
+        )
+        self.run(
+            _sort_high,
+            [xyz, self.cells, self.layout, self._used, self._high_counts, self._by_low],
+            [
+                *(
+                    self._next_place,
+                    self.order,
+                    self.cell_of_point,
+                    self._sorted_cells,
+                    self.points,
+                    self.stacks,
+                    self.columns,
+                ),
+                self.ranges,
+            ],
+        )
