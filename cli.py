@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,6 @@ if TYPE_CHECKING:
     from .datamesh.recording import RecordedEvent
 
 __all__ = ["app", "main"]
-
-_log = logging.getLogger(__name__)
 
 app = typer.Typer(
     name="warploom",
@@ -36,15 +33,29 @@ Settings = Annotated[
     ),
 ]
 
+TraceFile = Annotated[
+    Path | None, typer.Option("--trace", metavar="FILE", help="Write a trace of the run, for ui.perfetto.dev.")
+]
+MetricsPort = Annotated[
+    int | None,
+    typer.Option("--metrics-port", min=0, max=65535, help="Answer Prometheus on this port of 127.0.0.1; 0: any."),
+]
+
 
 @app.callback()
 def _root(
     log_level: Annotated[str, typer.Option("--log-level", help="debug, info, warning or error.")] = "warning",
+    log_dir: Annotated[
+        Path | None,
+        typer.Option("--log-dir", envvar="WARPLOOM_LOG_DIR", help="Folder for a log file of this process, rotated."),
+    ] = None,
 ) -> None:
-    level = logging.getLevelNamesMapping().get(log_level.upper())
-    if level is None:
-        raise typer.BadParameter(f"{log_level!r} is none of debug, info, warning, error", param_hint="--log-level")
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    from .dag.logs import start_logging
+
+    try:
+        start_logging(log_level, log_dir)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--log-level") from error
 
 
 @app.command()
@@ -55,6 +66,8 @@ def demo(
     profile: Profile = "cpu",
     device: Device = None,
     settings: Settings = None,
+    trace: TraceFile = None,
+    metrics_port: MetricsPort = None,
 ) -> None:
     """Drive a simulated street and track what is on it, with the truth beside it.
 
@@ -63,7 +76,16 @@ def demo(
     from .components.running import run_to_folder
 
     source = f"sim:street?seed={seed}&duration={seconds}"
-    run_to_folder(source, profile=profile, device=device, settings=settings or (), out=out, picture=True)
+    run_to_folder(
+        source,
+        profile=profile,
+        device=device,
+        settings=settings or (),
+        out=out,
+        picture=True,
+        trace=trace,
+        metrics_port=metrics_port,
+    )
 
 
 @app.command()
@@ -82,6 +104,8 @@ def run(
         bool, typer.Option("--realtime", help="Feed frames at their own pace; late ones are dropped.")
     ] = False,
     mcap: Annotated[bool, typer.Option(help="Write run.mcap.")] = True,
+    trace: TraceFile = None,
+    metrics_port: MetricsPort = None,
 ) -> None:
     """Perceive the frames of a recording or of the simulator.
 
@@ -98,6 +122,8 @@ def run(
         frames=frames,
         realtime=realtime,
         mcap=mcap,
+        trace=trace,
+        metrics_port=metrics_port,
     )
 
 

@@ -97,7 +97,11 @@ class RunReport:
             "latency_ms": {
                 "total": _statistics(self._total_ms),
                 "stages": {
-                    stage: {**_statistics(values), "wait_median": _median(self._wait_ms[stage])}
+                    stage: {
+                        **_statistics(values),
+                        "wait_median": _median(self._wait_ms[stage]),
+                        "wait_p99": _statistics(self._wait_ms[stage])["p99"],
+                    }
                     for stage, values in self._run_ms.items()
                 },
             },
@@ -151,9 +155,10 @@ def _table(columns: list[np.ndarray], chosen: np.ndarray, ignored: np.ndarray) -
 
 def _statistics(values: list[float]) -> dict[str, float | None]:
     if not values:
-        return {"median": None, "p99": None, "max": None}
+        return {"median": None, "p90": None, "p99": None, "max": None}
     return {
         "median": _rounded(float(np.median(values))),
+        "p90": _rounded(float(np.percentile(values, 90))),
         "p99": _rounded(float(np.percentile(values, 99))),
         "max": _rounded(max(values)),
     }

@@ -14,8 +14,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..dag.trace import Trace
 from ..errors import ConfigError, SinkError, SourceError
 from .machine import describe_machine
+from .observing import Observer
 from .pipeline import PerceptionFrame, Pipeline
 from .report import RunReport
 from .sinks import JsonLinesSink, McapSink
@@ -35,6 +37,8 @@ def run_to_folder(
     realtime: bool = False,
     mcap: bool = True,
     picture: bool = False,
+    trace: Path | None = None,
+    metrics_port: int | None = None,
 ) -> dict[str, Any]:
     """Perceives a source and writes `objects.jsonl`, `report.json` and `run.mcap` into a folder.
 
@@ -48,6 +52,8 @@ def run_to_folder(
         realtime: Feed the frames at their own pace; what is too slow drops frames, counted.
         mcap: Whether to record `run.mcap`.
         picture: Whether to draw a frame in the middle as `frame.png`.
+        trace: File for a trace of the run that ui.perfetto.dev opens.
+        metrics_port: Port of an endpoint for Prometheus on this machine.
 
     Returns:
         The report, as it is in `report.json`.
@@ -76,6 +82,9 @@ def run_to_folder(
     middle: PerceptionFrame | None = None
     with ExitStack() as stack:
         stack.enter_context(pipeline)
+        observer = stack.enter_context(Observer(pipeline, trace=trace, metrics_port=metrics_port))
+        if observer.server is not None:
+            console.print(f"metrics at http://127.0.0.1:{observer.server.port}/metrics")
         sinks: list[JsonLinesSink | McapSink] = [stack.enter_context(JsonLinesSink(out / "objects.jsonl"))]
         if mcap:
             # On a vehicle a slow disk must not hold up perception; offline nothing may be lost.
@@ -85,7 +94,7 @@ def run_to_folder(
         task = progress.add_task(source.name, total=length)
         first_frame = None
         # Closed before the sinks, so that the pipeline's threads are gone when an error leaves this block.
-        perceived = pipeline.run(itertools.islice(source, frames), realtime=realtime)
+        perceived = pipeline.run(itertools.islice(source, frames), realtime=realtime, watch=observer.watch)
         stack.callback(perceived.close)
         for frame in perceived:
             first_frame = first_frame or time.perf_counter() - started
@@ -119,6 +128,8 @@ def run_to_folder(
         },
         frames_skipped=[{"frame": s.index, "path": str(s.path), "reason": s.reason} for s in source.skipped],
         losses=pipeline.losses,
+        **({"trace": _trace_of(observer.trace)} if observer.trace is not None else {}),
+        metrics=observer.metrics.as_dict(),
         sinks={
             sink.path.name: {"written": sink.written, "dropped": sink.dropped, "objects_refused": sink.refused}
             for sink in sinks
@@ -141,6 +152,10 @@ def _progress(console: Console) -> Progress:
     )
 
 
+def _trace_of(trace: Trace) -> dict[str, Any]:
+    return {"path": str(trace.path), "events_dropped": trace.dropped, "failure": trace.failure}
+
+
 def _skipped_text(source: Source) -> str:
     if not source.skipped:
         return "the source is empty"
@@ -151,15 +166,15 @@ def _skipped_text(source: Source) -> str:
 def _print(console: Console, report: dict[str, Any], out: Path, outputs: list[str]) -> None:
     latency = report["latency_ms"]
     table = Table(title=f"latency, {report['frames']} frames of {report['points_per_frame']:,.0f} points", min_width=56)
-    for name in ("stage", "median [ms]", "p99 [ms]", "wait [ms]"):
+    for name in ("stage", "p50 [ms]", "p90 [ms]", "p99 [ms]", "max [ms]", "wait [ms]"):
         table.add_column(name, justify="left" if name == "stage" else "right")
     for stage, row in latency["stages"].items():
         if not stage.split(".")[1].startswith("commit"):
-            table.add_row(stage, f"{row['median']:.2f}", f"{row['p99']:.2f}", f"{row['wait_median']:.2f}")
+            table.add_row(stage, *_times(row), f"{row['wait_median']:.2f}")
     table.add_section()
     total = latency["total"]
     if total["median"] is not None:
-        table.add_row("whole frame", f"{total['median']:.2f}", f"{total['p99']:.2f}", "")
+        table.add_row("whole frame", *_times(total), "")
     console.print(table)
     if "objects" in report:
         table = Table(title="objects against the truth", min_width=56)
@@ -184,7 +199,13 @@ def _print(console: Console, report: dict[str, Any], out: Path, outputs: list[st
     for what in ("frames_failed", "frames_skipped", "losses"):
         if report[what]:
             console.print(f"{what.replace('_', ' ')}: {report[what]}", style="yellow")
+    if report.get("trace"):
+        console.print(f"trace in {report['trace']['path']}: open it at ui.perfetto.dev")
     console.print(f"outputs in {out}/: {', '.join(outputs)}")
+
+
+def _times(row: dict[str, float]) -> list[str]:
+    return [f"{row[key]:.2f}" for key in ("median", "p90", "p99", "max")]
 
 
 def _percent(value: float | None) -> str:

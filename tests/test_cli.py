@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from warploom.cli import main
+from warploom.dag.logs import stop_logging
 
 EXAMPLES = pathlib.Path(__file__).resolve().parent.parent / "examples"
 
@@ -25,6 +26,8 @@ def warploom(monkeypatch, capfd, tmp_path):
             main()
         except SystemExit as stop:
             code = stop.code or 0
+        finally:
+            stop_logging()
         output = "".join(capfd.readouterr())
         assert code == expect, output
         return output
@@ -52,7 +55,7 @@ def test_the_installed_command_runs():
 
 
 def test_demo_writes_objects_report_recording_and_picture(warploom, tmp_path):
-    output = warploom("demo", "--seconds", "0.5", "--out", "out")
+    output = warploom("--log-dir", "logs", "demo", "--seconds", "0.5", "--out", "out", "--trace", "out/trace.json")
     assert "whole frame" in output
     assert "ground F1" in output
     lines = (tmp_path / "out" / "objects.jsonl").read_text().splitlines()
@@ -61,6 +64,13 @@ def test_demo_writes_objects_report_recording_and_picture(warploom, tmp_path):
     assert report["frames"] == 5
     assert report["ground_f1"] > 0.9
     assert report["latency_ms"]["total"]["median"] > 0
+    total = report["latency_ms"]["total"]
+    assert total["median"] <= total["p90"] <= total["p99"] <= total["max"]
+    assert report["metrics"]["latency_ms"]["perception/obstacles"]["count"] == 5
+    assert report["metrics"]["runs"]["tracking.track"] == {"ok": 5}
+    assert report["trace"]["events_dropped"] == 0
+    assert {event["ph"] for event in json.loads((tmp_path / "out" / "trace.json").read_text())} >= set("MXbestfC")
+    assert len(list((tmp_path / "logs").glob("warploom-*.log"))) == 1
     assert (tmp_path / "out" / "run.mcap").stat().st_size > 1000
     assert (tmp_path / "out" / "frame.png").read_bytes().startswith(b"\x89PNG")
 
