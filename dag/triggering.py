@@ -50,21 +50,22 @@ class AnyTrigger(TriggerSource):
             window.subscribe(partial(self._on_commit, name, window.clock), partial(self._on_settle, name))
 
     def _on_commit(self, name: str, clock: Clock, entry: Entry) -> None:
-        order = (entry.epoch, entry.version)
+        version, epoch = entry.version, entry.epoch
         if not entry.triggers:
-            self._on_settle(name, entry.version, entry.epoch)
+            self._on_settle(name, version, epoch)
             return
         with self._lock:
-            new = order not in self._seen
+            new = (epoch, version) not in self._seen
             if new:
-                _remember(self._seen, order)
-                self._empty.pop(order, None)
-            passed = self._passed() if self._empty else ()
+                _remember(self._seen, (epoch, version))
+            passed = ()
+            if self._empty:
+                self._empty.pop((epoch, version), None)
+                passed = self._passed()
         if new:
-            now = clock.monotonic_ns()
-            versions = {name: entry.version}
-            self._offer(Trigger(entry.version, entry.received_ns, False, entry.epoch, now, versions))
-        self._settle(passed)
+            self._offer(Trigger(version, entry.received_ns, False, epoch, clock.monotonic_ns(), {name: version}))
+        if passed:
+            self._settle(passed)
 
     def _on_settle(self, name: str, version: int, epoch: int) -> None:
         order = (epoch, version)

@@ -114,15 +114,16 @@ class Change(Generic[T]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._abandon()
+        if not self._closed:
+            self._abandon()
 
     def __del__(self) -> None:
-        self._abandon()
+        if not self._closed:
+            self._abandon()
 
     def _abandon(self) -> None:
-        if not self._closed:
-            self._closed = True
-            self._window.losses.count(self._window.topic, "abandoned", self._version or 0)
+        self._closed = True
+        self._window.losses.count(self._window.topic, "abandoned", self._version or 0)
 
     def _commit(self, policy: CommitPolicy | Reorder, equal: EqualVersion, triggers: bool | None) -> Status:
         window, version, value = self._window, self._version, self._value
@@ -137,7 +138,8 @@ class Change(Generic[T]):
         self._closed = True
         now = window.clock.monotonic_ns()
         received = now if self._received_ns is None else self._received_ns
-        entry = Entry(version, value, received, now, self._epoch, True, self._completion)
+        epoch = window.epoch if self._epoch == CURRENT_EPOCH else self._epoch
+        entry = Entry(version, value, received, now, epoch, True, self._completion)
         status = window.commit(policy, entry, equal, triggers)
         if status is Status.REJECTED:
             self._closed = False
@@ -288,7 +290,7 @@ class Output(_Handle[T]):
 
     def allocate_change(self) -> Change[T]:
         """A new change, to be written and committed."""
-        return Change(self.window, self.epoch)
+        return Change(self._window or self.window, self.epoch)
 
     def commit(
         self,

@@ -1,12 +1,13 @@
 """Handles: how a component declares, reads and writes."""
 
+import gc
 import logging
 import time
 
 import numpy as np
 import pytest
 
-from warploom.dag import DataProcessComponent, Trigger
+from warploom.dag import BacklogConfig, DataProcessComponent, Trigger
 from warploom.datamesh import (
     CommitPolicy,
     DataMesh,
@@ -84,6 +85,20 @@ def test_a_component_reads_at_the_trigger_version_and_writes_at_it(manager):
     written = mesh.window("map/local").snapshot()
     assert written.versions == (100,)
     assert written.last().number == 10
+
+
+def test_the_example_runs_in_the_runtime(manager):
+    """As above, with its trigger and its thread: each LiDAR frame gives a map at its version."""
+    mesh, component, lidar = manager
+    component.set_trigger("lidar", BacklogConfig(policy="block"))
+    component.start()
+    for version in (100, 200, 300):
+        publish(lidar, version, Cloud(version))
+    component.stop()
+    written = mesh.window("map/local").snapshot()
+    assert written.versions == (200, 300)
+    assert [one.number for one in written] == [2000, 3000]
+    assert mesh.losses.as_dict() == {}
 
 
 def test_a_component_that_comes_late_sees_why(manager, caplog):
@@ -208,6 +223,55 @@ def test_a_change_left_without_a_commit_is_counted_and_cannot_come_back():
     with pytest.raises(RuntimeError, match="committed or abandoned"):
         output.commit(DISCARD, change)
     assert losses["topic", "abandoned"] == 1
+
+
+def test_a_change_that_is_dropped_is_counted():
+    losses = LossCounters()
+    output = bound(Output, Window("topic", 8, losses))
+    change = output.allocate_change()
+    change.set_version(7)
+    change.value = 1
+    del change
+    gc.collect()
+    assert losses["topic", "abandoned"] == 1
+    assert len(output.window.snapshot()) == 0
+
+
+def test_a_change_is_made_in_the_epoch_of_its_handle_or_the_one_it_names():
+    output = bound(Output)
+    publish(output, 5, "a")
+    output.epoch = 2
+    publish(output, 3, "b")
+    with output.allocate_change() as change:
+        change.set_version(1, epoch=4)
+        change.value = "c"
+        assert output.commit(DISCARD, change) is Status.OK
+    assert (output.window.epoch, output.window.snapshot().versions) == (4, (1,))
+    assert output.window.snapshot().entry(0).epoch == 4
+    assert publish(output, 9, "d") is Status.OUT_OF_ORDER
+
+
+def test_a_payload_on_a_device_carries_its_event_to_the_readers():
+    class Event:
+        stream = "own"
+        waited = 0
+
+        def synchronize(self):
+            self.waited += 1
+
+    event, output = Event(), bound(Output)
+    with output.allocate_change() as change:
+        change.set_version(1)
+        change.value = "on the device"
+        change.completes_with(event)
+        output.commit(DISCARD, change)
+    reader = bound(Input, output.window)
+    with reader.access(stream="own") as snapshot:
+        assert snapshot.last() == "on the device"
+    assert event.waited == 0
+    with reader.access() as snapshot:
+        assert snapshot.last() == "on the device"
+    assert event.waited == 1
 
 
 def test_a_commit_carries_when_the_sensor_data_was_received():

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from warploom.datamesh import Freezable, freeze
+from warploom.datamesh import Freezable, checksum, freeze
 
 
 @dataclass
@@ -54,3 +54,39 @@ def test_freezing_twice_is_harmless_and_copies_stay_writable():
     copy = array.copy()
     copy[0] = 7.0
     assert array[0] == 0.0
+
+
+class DeviceArray:
+    """Stands in for an array on a device, which NumPy cannot protect."""
+
+    def __init__(self, values):
+        self.values = np.asarray(values)
+
+    def numpy(self):
+        return self.values
+
+
+def test_a_checksum_sees_every_byte_at_any_depth():
+    def payload(x=0.0, key="a", text="t", on_device=1):
+        return Cloud(np.array([1.0, x]), {key: [np.zeros((2, 3))[:, 1], DeviceArray([on_device])], "b": (text, 3)})
+
+    sums = {checksum(payload(**change)) for change in ({}, {"x": -0.0}, {"key": "c"}, {"text": "u"}, {"on_device": 2})}
+    assert len(sums) == 5
+    assert checksum(payload()) == checksum(payload())
+
+
+@pytest.mark.parametrize("value", [object(), np.array([object()]), np.zeros(0), np.float32(2.0), np.array(5), {}, None])
+def test_a_checksum_is_taken_of_anything(value):
+    assert checksum(value) == checksum(value)
+
+
+def test_torch_and_warp_arrays_have_checksums():
+    torch = pytest.importorskip("torch")
+    wp = pytest.importorskip("warp")
+    tensor, array = torch.zeros(4), wp.zeros(4, dtype=wp.float32, device="cpu")
+    before = [checksum(tensor), checksum({"a": array})]
+    freeze([tensor, array])
+    tensor[2] = 1.0
+    array.fill_(1.0)
+    assert checksum(tensor) != before[0]
+    assert checksum({"a": array}) != before[1]
