@@ -18,7 +18,16 @@ from scipy.optimize import linear_sum_assignment
 
 from ..geometry import box_overlap
 
-__all__ = ["AverageMot", "ClearMot", "TrackTable", "TrackingSummary", "average_mot", "clear_mot", "tracking_summary"]
+__all__ = [
+    "AverageMot",
+    "ClearMot",
+    "TrackTable",
+    "TrackingSummary",
+    "average_mot",
+    "clear_mot",
+    "overlaps_by_frame",
+    "tracking_summary",
+]
 
 _RECALL_VALUES = 40
 _IMPOSSIBLE = 1e4
@@ -214,14 +223,7 @@ class _Recording:
 
     def _likeness(self, measure: str, threshold: float) -> list[tuple[slice, slice, np.ndarray]]:
         """For each frame with truth and tracks: their rows, and the cost of each pair (`_IMPOSSIBLE` if too far)."""
-        frames = np.intersect1d(self.truth.frames, self.tracks.frames)
-        bounds = [
-            (np.searchsorted(t.frames, frames), np.searchsorted(t.frames, frames, side="right"))
-            for t in (self.truth, self.tracks)
-        ]
-        blocks = [(slice(a, b), slice(c, d)) for a, b, c, d in zip(*bounds[0], *bounds[1], strict=True)]
-        grids = [np.mgrid[rows, columns].reshape(2, -1) for rows, columns in blocks]
-        i, j = np.concatenate(grids, axis=1) if grids else np.empty((2, 0), np.int64)
+        blocks, i, j = _pairs_by_frame(self.truth, self.tracks)
         a, b = self.truth.boxes[i], self.tracks.boxes[j]
         distance = np.linalg.norm(a[:, :2] - b[:, :2], axis=1)
         cost = np.full(len(i), _IMPOSSIBLE)
@@ -229,18 +231,15 @@ class _Recording:
             near = distance <= threshold
             cost[near] = distance[near]
         elif measure in ("iou_3d", "iou_bev"):
-            touching = distance < 0.5 * (np.hypot(a[:, 3], a[:, 4]) + np.hypot(b[:, 3], b[:, 4]))
-            overlap = np.zeros(len(i))
-            overlap[touching] = box_overlap(a[touching], b[touching])[measure == "iou_3d"]
+            overlap, touching = _overlap(a, b, bev=measure == "iou_bev")
             near = (overlap >= threshold) & touching
             cost[near] = 1.0 - overlap[near]
         else:
             raise ValueError(f"no measure {measure!r}; there are: iou_3d, iou_bev, distance")
         self.measure = measure
-        ends = np.cumsum([g.shape[1] for g in grids])
         return [
-            (rows, columns, part.reshape(rows.stop - rows.start, -1))
-            for (rows, columns), part in zip(blocks, np.split(cost, ends[:-1]) if grids else [], strict=True)
+            (rows, columns, part)
+            for (rows, columns), part in zip(blocks, _cut(cost, blocks), strict=True)
             if (part < _IMPOSSIBLE).any()
         ]
 
@@ -259,6 +258,46 @@ class _Recording:
             match[rows.start + r[made]] = chosen[c[made]]
             self.cost[rows.start + r[made]] = price[made]
         return match
+
+
+def overlaps_by_frame(truth: TrackTable, tracks: TrackTable) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """For each frame with truth and tracks: rows of the truth (a,), of the tracks (b,), overlaps in space (a, b)."""
+    blocks, i, j = _pairs_by_frame(truth, tracks)
+    overlap, _ = _overlap(truth.boxes[i], tracks.boxes[j], bev=False)
+    return [
+        (np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop), part)
+        for (rows, columns), part in zip(blocks, _cut(overlap, blocks), strict=True)
+    ]
+
+
+def _pairs_by_frame(truth: TrackTable, tracks: TrackTable) -> tuple[list[tuple[slice, slice]], np.ndarray, np.ndarray]:
+    """For each frame with truth and tracks their rows; and of all pairs in these the row of each."""
+    frames = np.intersect1d(truth.frames, tracks.frames)
+    bounds = [
+        (np.searchsorted(t.frames, frames), np.searchsorted(t.frames, frames, side="right")) for t in (truth, tracks)
+    ]
+    blocks = [(slice(a, b), slice(c, d)) for a, b, c, d in zip(*bounds[0], *bounds[1], strict=True)]
+    grids = [np.mgrid[rows, columns].reshape(2, -1) for rows, columns in blocks]
+    i, j = np.concatenate(grids, axis=1) if grids else np.empty((2, 0), np.int64)
+    return blocks, i, j
+
+
+def _cut(values: np.ndarray, blocks: list[tuple[slice, slice]]) -> list[np.ndarray]:
+    """Values of all pairs as a matrix for each frame."""
+    shapes = [(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in blocks]
+    ends = np.cumsum([a * b for a, b in shapes])
+    return (
+        [part.reshape(shape) for part, shape in zip(np.split(values, ends[:-1]), shapes, strict=True)] if blocks else []
+    )
+
+
+def _overlap(a: np.ndarray, b: np.ndarray, *, bev: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Overlap of pairs of boxes, from above or in space, and whether they are near enough to have any."""
+    distance = np.linalg.norm(a[:, :2] - b[:, :2], axis=1)
+    touching = distance < 0.5 * (np.hypot(a[:, 3], a[:, 4]) + np.hypot(b[:, 3], b[:, 4]))
+    overlap = np.zeros(len(a))
+    overlap[touching] = box_overlap(a[touching], b[touching])[0 if bev else 1]
+    return overlap, touching
 
 
 def _score(recordings: list[_Recording], least_confidence: float | None) -> ClearMot:
