@@ -249,7 +249,8 @@ class TimeTrigger(TriggerSource):
                 return
             at = self._clock.monotonic_ns()
             missed = max(0, at - due_ns) // self._period
-            self._version = version = self._next_version(missed)
+            late = at - due_ns - missed * self._period
+            self._version = version = self._next_version(self._clock.now_ns() - late, missed)
             self._schedule(due_ns + (missed + 1) * self._period)
         if missed:
             self._losses.count(self._place, "overrun", version, amount=missed)
@@ -259,8 +260,8 @@ class TimeTrigger(TriggerSource):
             trigger = trigger._replace(settled=True)
         self._offer(trigger)
 
-    def _next_version(self, missed: int) -> int:
-        now, last = self._clock.now_ns(), self._version
+    def _next_version(self, now: int, missed: int) -> int:
+        last = self._version
         if last is None:
             return now
         expected = last + (missed + 1) * self._period

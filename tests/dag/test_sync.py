@@ -1,53 +1,470 @@
-"""Processors that connect a graph to the mesh."""
+"""Processors that connect a graph to the mesh: weak sync, strong sync, commit; alone, and in a graph with workers."""
+
+import threading
 
 import pytest
+from graph_parts import Call
+from pydantic import ValidationError
 
-from warploom.dag import CommitDagProcessor, Trigger
-from warploom.datamesh import DataMesh, Output, Status
+from warploom.dag import (
+    AlignDagProcessor,
+    BacklogConfig,
+    CommitDagProcessor,
+    DagComponent,
+    GetRecentDagProcessor,
+    In,
+    MonotonicDagComponent,
+    Processor,
+    ProcessorHarness,
+    Trigger,
+    Vertex,
+)
+from warploom.datamesh import DataMesh, Input, ManualClock, Outcome, Output, Status
+
+WAIT = 20.0
+MS = 1_000_000
+pytestmark = pytest.mark.usefixtures("no_thread_left")
+
+
+class Mesh:
+    """A mesh on a manual clock, with both ends of its topics."""
+
+    def __init__(self, *topics, capacity=8, clock=None):
+        self.clock = ManualClock() if clock is None else clock
+        self.mesh = DataMesh(capacity, clock=self.clock)
+        self.inputs, self.outputs = {}, {}
+        for topic in topics:
+            self.inputs[topic], self.outputs[topic] = Input(), Output()
+            self.inputs[topic].bind(topic, self.mesh.window(topic))
+            self.outputs[topic].bind(topic, self.mesh.window(topic))
+
+    def commit(self, topic, *versions, epoch=None, completion=None):
+        from warploom.datamesh import CommitPolicy
+
+        for version in versions:
+            with self.outputs[topic].allocate_change() as change:
+                change.set_version(version, epoch=epoch)
+                change.value = f"{topic} {version}"
+                if completion is not None:
+                    change.completes_with(completion)
+                self.outputs[topic].commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
 
 
 @pytest.fixture
 def committing():
     """A processor that commits to a window, and the mesh."""
-    mesh = DataMesh()
-    output = Output()
-    output.bind("result", mesh.window("topic"))
-    processor = CommitDagProcessor()
-    processor.component_outputs = {"result": output}
-    processor.init(CommitDagProcessor.Config(output="result"))
-    return processor, mesh
+
+    def make(**config):
+        mesh = Mesh("topic")
+        harness = ProcessorHarness(
+            CommitDagProcessor, {"output": "result", **config}, outputs={"result": mesh.outputs["topic"]}
+        )
+        return harness.feed(value="datum"), mesh.mesh
+
+    return make
 
 
-def test_commits_at_the_version_of_the_trigger_with_its_time_of_reception(committing):
-    processor, mesh = committing
-    processor.value.value = "datum"
-    assert processor.process(Trigger(5, received_ns=123)) is Status.OK
+def statuses(harness, *versions):
+    return [harness.run(Trigger(version)) or harness.status for version in versions]
+
+
+def test_commits_at_the_version_of_the_trigger_with_its_time_of_reception_and_epoch(committing):
+    harness, mesh = committing()
+    harness.run(Trigger(5, received_ns=123, epoch=2))
+    assert harness.status is Status.OK
     entry = mesh.window("topic").snapshot().entry(0)
-    assert (entry.version, entry.value, entry.received_ns) == (5, "datum", 123)
-    assert entry.committed_ns > 123
+    assert (entry.version, entry.value, entry.received_ns, entry.epoch) == (5, "datum", 123, 2)
 
 
 def test_an_older_version_is_discarded_and_counted(committing):
-    processor, mesh = committing
-    processor.value.value = "datum"
-    assert [processor.process(Trigger(version)) for version in (5, 4, 5, 6)] == [
-        Status.OK,
-        Status.OUT_OF_ORDER,
-        Status.DUPLICATE,
-        Status.OK,
-    ]
+    harness, mesh = committing()
+    assert statuses(harness, 5, 4, 5, 6) == [Status.OK, Status.OUT_OF_ORDER, Status.DUPLICATE, Status.OK]
     assert mesh.losses.as_dict() == {"topic": {"duplicate": 1, "out_of_order": 1}}
 
 
-def test_without_a_value_nothing_is_published(committing):
-    processor, mesh = committing
+@pytest.mark.parametrize(
+    ("config", "versions", "losses"),
+    [
+        ({"policy": "insert_sorted"}, (4, 5), {}),
+        ({"policy": "reject"}, (5,), {"rejected": 1, "abandoned": 1}),
+        ({"policy": "overwrite"}, (4,), {"overwritten": 1}),
+        ({"policy": "force_new_epoch"}, (4,), {}),
+        ({"policy": "reorder", "delay_ms": 5, "depth": 1}, (4,), {}),
+        ({"policy": "reorder", "depth": 0}, (5,), {"out_of_order": 1}),
+    ],
+)
+def test_every_policy_can_be_configured(config, versions, losses, committing):
+    harness, mesh = committing(**config)
+    statuses(harness, 5, 4)
+    assert mesh.window("topic").snapshot().versions == versions
+    assert mesh.losses.as_dict() == ({"topic": losses} if losses else {})
+
+
+def test_a_topic_with_epochs_of_its_own_goes_on_after_it_began_one(committing):
+    harness, mesh = committing(policy="force_new_epoch")
+    for version in (5, 4, 6):
+        harness.run(Trigger(version, epoch=0))
+        assert harness.status is Status.OK
+    assert (mesh.window("topic").epoch, mesh.window("topic").snapshot().versions) == (1, (4, 6))
+
+
+def test_equal_versions_and_triggering_can_be_configured(committing):
+    harness, mesh = committing(policy="insert_sorted", equal="replace", triggers=True)
+    told = []
+    mesh.window("topic").subscribe(lambda e: told.append((e.version, e.triggers)), lambda version, epoch: None)
+    statuses(harness, 5, 4, 4)
+    assert told == [(5, True), (4, True), (4, False)]
+    harness, _ = committing(equal="error")
+    statuses(harness, 5)
+    with pytest.raises(ValueError, match="equal versions are errors"):
+        harness.run(Trigger(5))
+
+
+def test_without_a_value_nothing_is_published():
+    mesh = Mesh("topic")
+    harness = ProcessorHarness(CommitDagProcessor, {"output": "result"}, outputs={"result": mesh.outputs["topic"]})
     with pytest.raises(LookupError, match="'value' has no value"):
-        processor.process(Trigger(1))
-    assert len(mesh.window("topic").snapshot()) == 0
-    assert mesh.losses.as_dict() == {"topic": {"abandoned": 1}}
+        harness.run(1)
+    assert len(mesh.mesh.window("topic").snapshot()) == 0
+    assert mesh.mesh.losses.as_dict() == {"topic": {"abandoned": 1}}
 
 
-def test_an_output_that_is_not_there_is_refused(committing):
-    processor, _ = committing
-    with pytest.raises(ValueError, match="the component has no output 'rseult'; it has: result"):
-        processor.init(CommitDagProcessor.Config(output="rseult"))
+@pytest.mark.parametrize(
+    ("processor", "config", "said"),
+    [
+        (CommitDagProcessor, {"output": "rseult"}, "the component has no output 'rseult'; it has: result"),
+        (GetRecentDagProcessor, {"input": "camra"}, "the component has no input 'camra'; it has: camera"),
+        (
+            AlignDagProcessor,
+            {"inputs": ["camera", "x"], "timeout_ms": 1},
+            "the component has no input 'x'; it has: camera",
+        ),
+    ],
+)
+def test_a_handle_that_is_not_there_is_refused(processor, config, said):
+    mesh = Mesh("camera", "result")
+    with pytest.raises(ValueError, match=said):
+        ProcessorHarness(
+            processor, config, inputs={"camera": mesh.inputs["camera"]}, outputs={"result": mesh.outputs["result"]}
+        )
+
+
+@pytest.mark.parametrize(
+    "config", [{"inputs": [], "timeout_ms": 1}, {"inputs": ["a"], "timeout_ms": -1}, {"inputs": ["a"]}]
+)
+def test_an_alignment_that_makes_no_sense_is_refused(config):
+    with pytest.raises(ValidationError):
+        AlignDagProcessor.Config(**config)
+
+
+def recent(mesh, **config):
+    return ProcessorHarness(GetRecentDagProcessor, {"input": "map", **config}, inputs=mesh.inputs)
+
+
+@pytest.mark.parametrize(
+    ("version", "max_age_ms", "got"),
+    [(9, None, None), (10, None, 10), (19, None, 10), (20, None, 20), (10**15, None, 30), (35, 5e-6, 30),
+     (36, 5e-6, None), (30, 0, 30), (31, 0, None)],
+)  # fmt: skip
+def test_weak_sync_gives_the_newest_that_is_not_newer_than_the_trigger(version, max_age_ms, got):
+    mesh = Mesh("map")
+    mesh.commit("map", 10, 20, 30)
+    harness = recent(mesh, max_age_ms=max_age_ms)
+    outputs = harness.run(version)
+    assert outputs == ({} if got is None else {"value": f"map {got}", "version": got})
+    assert harness.status is (Status.MISS if got is None else Status.OK)
+
+
+def test_weak_sync_returns_at_once_when_there_is_nothing():
+    harness = recent(Mesh("map"))
+    assert harness.run(10) == {}
+    assert harness.status is Status.MISS
+
+
+def test_weak_sync_is_causal_across_epochs():
+    """A map of the epoch before is older than any trigger of this one; one of the next epoch is not."""
+    mesh = Mesh("map")
+    mesh.commit("map", 10, 20)
+    harness = recent(mesh)
+    assert harness.run(Trigger(5, epoch=1)) == {"value": "map 20", "version": 20}
+    assert recent(mesh, max_age_ms=1000).run(Trigger(5, epoch=1)) == {}, "there is no age across epochs"
+    mesh.commit("map", 7, epoch=1)
+    assert harness.run(Trigger(5, epoch=1)) == {}
+    assert harness.run(Trigger(8, epoch=1)) == {"value": "map 7", "version": 7}
+    assert harness.run(Trigger(15, epoch=0)) == {"value": "map 10", "version": 10}
+
+
+class Waiting:
+    """An alignment of some inputs with one trigger, in steps."""
+
+    def __init__(self, mesh, **config):
+        config = {"inputs": list(mesh.inputs), "timeout_ms": 100e-6, **config}
+        self.harness = ProcessorHarness(AlignDagProcessor, config, inputs=mesh.inputs)
+        self.processor, self.resumed = self.harness.processor, 0
+
+    def begin(self, trigger):
+        self.trigger = trigger
+        return self.processor.begin(trigger, self.resume)
+
+    def resume(self):
+        self.resumed += 1
+
+    def end(self):
+        status = self.processor.process(self.trigger)
+        port = self.processor.aligned
+        return status, port.value if port.present else None
+
+
+def test_strong_sync_goes_on_at_once_when_all_is_there():
+    mesh = Mesh("camera", "radar")
+    for topic in ("camera", "radar"):
+        mesh.commit(topic, 10)
+    waiting = Waiting(mesh)
+    assert not waiting.begin(Trigger(10))
+    status, aligned = waiting.end()
+    assert status is Status.OK
+    assert aligned.values == {"camera": "camera 10", "radar": "radar 10"}
+    assert aligned.versions == {"camera": 10, "radar": 10}
+    assert aligned.absent == ()
+    assert waiting.resumed == 0
+
+
+def test_strong_sync_waits_for_the_last_of_its_inputs():
+    mesh = Mesh("camera", "radar")
+    waiting = Waiting(mesh)
+    assert waiting.begin(Trigger(10))
+    mesh.commit("radar", 10)
+    assert waiting.resumed == 0
+    mesh.commit("camera", 10)
+    assert waiting.resumed == 1
+    assert waiting.end()[0] is Status.OK
+
+
+def test_a_partial_set_names_the_absent_with_the_reason_of_each():
+    mesh = Mesh("camera", "radar", "hdmap", capacity=1)
+    waiting = Waiting(mesh)
+    mesh.commit("camera", 10)
+    assert waiting.begin(Trigger(10))
+    mesh.outputs["radar"].settle(10)
+    mesh.clock.advance(99)
+    assert waiting.resumed == 0
+    mesh.clock.advance(1)
+    assert waiting.resumed == 1
+    status, aligned = waiting.end()
+    assert status is Status.TIMEOUT
+    assert aligned.values == {"camera": "camera 10"}
+    assert aligned.absent == ("radar", "hdmap")
+    assert aligned.outcomes == {
+        "camera": Outcome.FOUND,
+        "radar": Outcome.SETTLED_EMPTY,
+        "hdmap": Outcome.TIMEOUT,
+    }
+    assert waiting.processor.losses.as_dict() == {"AlignDagProcessor": {"hdmap timeout": 1, "radar settled empty": 1}}
+
+
+@pytest.mark.parametrize(("partial", "given"), [(True, True), (False, False)])
+def test_without_partial_sets_nothing_is_given_when_something_is_absent(partial, given):
+    mesh = Mesh("camera", "radar", capacity=1)
+    mesh.commit("camera", 10)
+    mesh.commit("radar", 10, 20)
+    waiting = Waiting(mesh, partial=partial)
+    assert not waiting.begin(Trigger(10))
+    status, aligned = waiting.end()
+    assert status is Status.MISS
+    assert (aligned is not None) is given
+    if given:
+        assert aligned.outcomes == {"camera": Outcome.FOUND, "radar": Outcome.EVICTED}
+
+
+def test_the_deadline_counts_from_the_trigger_and_is_never_restarted():
+    mesh = Mesh("camera")
+    waiting = Waiting(mesh)
+    mesh.clock.advance(1000)
+    assert waiting.begin(Trigger(10, at_ns=950))
+    mesh.clock.advance(49)
+    mesh.commit("camera", 5)
+    assert waiting.resumed == 0
+    mesh.clock.advance(1)
+    assert waiting.resumed == 1
+    assert waiting.end()[0] is Status.TIMEOUT
+    assert not waiting.begin(Trigger(11, at_ns=800)), "its time was over before it began"
+    assert waiting.end()[0] is Status.TIMEOUT
+
+
+def test_a_timeout_of_zero_only_looks():
+    mesh = Mesh("camera")
+    mesh.commit("camera", 10)
+    waiting = Waiting(mesh, timeout_ms=0)
+    for version, expected in ((10, Status.OK), (11, Status.TIMEOUT)):
+        assert not waiting.begin(Trigger(version))
+        assert waiting.end()[0] is expected
+
+
+def test_a_tolerance_takes_the_nearest_that_is_there():
+    mesh = Mesh("camera")
+    mesh.commit("camera", 6, 13)
+    waiting = Waiting(mesh, tolerance_ms=5e-6)
+    assert not waiting.begin(Trigger(10))
+    assert waiting.end()[1].versions == {"camera": 13}
+
+
+def test_eviction_and_shutdown_end_the_wait():
+    mesh = Mesh("camera", capacity=1)
+    waiting = Waiting(mesh)
+    assert waiting.begin(Trigger(10))
+    mesh.commit("camera", 8, 20, 30)
+    assert waiting.resumed == 1
+    assert waiting.end()[0] is Status.MISS
+    assert waiting.begin(Trigger(40))
+    mesh.inputs["camera"].end_waits()
+    assert waiting.end()[0] is Status.SHUTDOWN
+
+
+def test_what_a_device_still_writes_is_waited_for_when_it_is_given_on():
+    class Event:
+        stream, waited = "own", 0
+
+        def synchronize(self):
+            self.waited += 1
+
+    mesh, event = Mesh("camera"), Event()
+    mesh.commit("camera", 10, completion=event)
+    waiting = Waiting(mesh)
+    waiting.begin(Trigger(10))
+    assert event.waited == 0
+    waiting.end()
+    assert event.waited == 1
+
+
+class Collect(Processor):
+    """Gives what was aligned to the context."""
+
+    aligned: In[object]
+
+    def process(self, trigger):
+        self.context(trigger.version, self.aligned.value)
+        return Status.OK
+
+
+def aligning(mesh, on_aligned, *, workers=1, in_flight=1, timeout_ms=60_000.0, kind=DagComponent, extra=()):
+    """A component that aligns `camera` with its trigger `lidar`; it is given to `on_aligned`."""
+    component = kind("fusion")
+    component.add_handles(["lidar", "camera"], ["result"])
+    component.bind(mesh.mesh, {"lidar": "lidar", "camera": "camera", "result": "result"})
+    align, collect = AlignDagProcessor(), Collect()
+    align.component_inputs, align.losses, align.place = component.inputs, mesh.mesh.losses, "fusion.align"
+    align.init(AlignDagProcessor.Config(inputs=["camera"], timeout_ms=timeout_ms))
+    collect.context = on_aligned
+    vertices = [
+        Vertex(
+            "align",
+            align,
+            {},
+            {"aligned": "aligned"},
+            config=AlignDagProcessor.Config(inputs=["camera"], timeout_ms=timeout_ms),
+        )
+    ]
+    vertices += [Vertex("collect", collect, {"aligned": "aligned"}, {}), *extra]
+    component.set_graph(vertices, workers=workers, in_flight=in_flight)
+    component.set_trigger("lidar", BacklogConfig(policy="fifo", depth=6))
+    return component
+
+
+class Results:
+    def __init__(self):
+        self.got, self.changed = {}, threading.Condition()
+
+    def __call__(self, version, aligned):
+        with self.changed:
+            self.got[version] = aligned
+            self.changed.notify_all()
+
+    def wait_for(self, *versions):
+        with self.changed:
+            assert self.changed.wait_for(lambda: set(versions) <= set(self.got), WAIT), sorted(self.got)
+
+
+def test_a_waiter_gives_its_worker_back():
+    """One worker: the vertex beside the waiting one runs, and commits what is waited for."""
+    mesh, results = Mesh("lidar", "camera", "result"), Results()
+    producer = Call()
+    producer.name = "producer"
+    producer.context = {"producer": lambda trigger, value: mesh.commit("camera", trigger.version)}
+    extra = [Vertex("producer", producer, {"value": "lidar"}, {"result": "produced"})]
+    component = aligning(mesh, results, workers=1, extra=extra)
+    component.start()
+    mesh.commit("lidar", 10, 20, 30)
+    results.wait_for(10, 20, 30)
+    component.stop()
+    assert [aligned.versions for aligned in results.got.values()] == [{"camera": 10}, {"camera": 20}, {"camera": 30}]
+
+
+def test_a_pool_of_one_whose_producer_is_queued_behind_it_ends_with_the_deadline_not_in_a_deadlock():
+    """The monotonic graph lets one frame in; frame 20, which would bring the camera of frame 10, waits behind it."""
+    mesh, results = Mesh("lidar", "camera", "result"), Results()
+    producer = Call()
+    producer.name = "producer"
+    producer.context = {"producer": lambda trigger, value: trigger.version == 20 and mesh.commit("camera", 10, 20)}
+    extra = [Vertex("producer", producer, {"value": "lidar"}, {"result": "produced"})]
+    component = aligning(mesh, results, timeout_ms=1000e-6, kind=MonotonicDagComponent, extra=extra)
+    component.start()
+    mesh.commit("lidar", 10, 20)
+    while not mesh.mesh.window("camera")._waits:
+        threading.Event().wait(0.001)
+    assert results.got == {}
+    mesh.clock.advance(1000)
+    results.wait_for(10, 20)
+    component.stop()
+    assert results.got[10].outcomes == {"camera": Outcome.TIMEOUT}
+    assert results.got[20].outcomes == {"camera": Outcome.TIMEOUT}, "its time counted while it was queued"
+
+
+def test_the_main_flow_goes_on_without_a_dead_input():
+    mesh, results = Mesh("lidar", "camera", "result"), Results()
+    component = aligning(mesh, results, timeout_ms=0.0)
+    component.start()
+    for version in (10, 20, 30):
+        mesh.commit("lidar", version)
+        results.wait_for(version)
+    component.stop()
+    assert [aligned.absent for aligned in results.got.values()] == [("camera",)] * 3
+    assert mesh.mesh.losses.as_dict() == {"fusion.align": {"camera timeout": 3}}
+
+
+@pytest.mark.parametrize("workers", [1, 2, 8])
+def test_a_stop_ends_the_waits_and_finishes_the_frames_behind_them_and_the_component_starts_again(workers):
+    mesh, results = Mesh("lidar", "camera", "result"), Results()
+    component = aligning(mesh, results, workers=workers, in_flight=2)
+    for cycle in range(3):
+        component.start()
+        base = cycle * 100
+        mesh.commit("lidar", base + 10, base + 20, base + 30)
+        mesh.commit("camera", base + 10)
+        results.wait_for(base + 10)
+        component.stop()
+        assert results.got[base + 10].absent == ()
+        assert results.got[base + 20].outcomes == results.got[base + 30].outcomes == {"camera": Outcome.SHUTDOWN}
+
+
+def test_results_do_not_depend_on_the_number_of_workers():
+    """Every camera frame comes before or after its lidar frame, as the seed says; each is found."""
+    import hashlib
+    import random
+
+    hashes = set()
+    for workers in (1, 2, 8):
+        mesh, results = Mesh("lidar", "camera", "result", capacity=64), Results()
+        component = aligning(mesh, results, workers=workers, in_flight=4)
+        component.start()
+        order = random.Random(4)
+        for version in range(30):
+            topics = ["lidar", "camera"]
+            order.shuffle(topics)
+            for topic in topics:
+                mesh.commit(topic, version)
+            results.wait_for(version)
+        component.stop()
+        said = repr([(version, one.values, one.outcomes) for version, one in results.got.items()])
+        hashes.add(hashlib.sha256(said.encode()).hexdigest())
+        assert all(one.absent == () for one in results.got.values())
+    assert len(hashes) == 1
