@@ -1,9 +1,7 @@
-"""Oriented boxes around clusters of points.
+"""Oriented boxes around clusters of points: those whose edges the points are closest to, or of the least area.
 
-The heading of a cluster is searched for, all clusters and angles at once: by the closeness of its points to the edges
-of the box, which suits the L that a LiDAR sees of a car (Zhang, Xu, Dong, Dolan: Efficient L-shape fitting for vehicle
-detection using laser scanners, IV 2017), or by the least area. The search looks at up to 64 points of a cluster; the
-extents are those of all its points.
+Points are put in the order of their clusters first; each cluster's box is then found by itself, in `box_l_shape.py`
+or `box_hull.py`.
 """
 
 from __future__ import annotations
@@ -14,26 +12,28 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .box_samples import FAR, SAMPLES, sample_evenly, sample_extremes, sample_extremes_in_order
+from .box_hull import RUN, find_hulls, find_hulls_in_parts, fit_hulls, fit_hulls_in_parts
+from .box_l_shape import (
+    DIRECTIONS,
+    GROUPS,
+    SAMPLES,
+    Scores,
+    choose_directions,
+    fit_l_shapes_in_parts,
+    measure_reach,
+    sample_evenly,
+    score_widely,
+    write_boxes,
+)
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .threads import launch_parts, thread_count
 
 __all__ = ["FitBoxes", "fit_boxes"]
 
-# Which of two like angles wins must not hang on whether a compiler fuses a multiplication with an addition.
-wp.set_module_options({"fuse_fp": False})
-
-_EDGE = wp.constant(0.01)  # [m] nearer to an edge than this is no better
-_AREA = wp.constant(1)
-_METHODS = {
-    # name: (criterion, directions in a quarter turn); the first look takes every fourth
-    "l_shape": (0, 96),
-    "min_area": (1, 384),
-}
-_STRIDE = wp.constant(4)
-_LANES = wp.constant(8)  # directions that one thread scores side by side: a CPU's compiler makes vectors of them
-_vec8 = wp.types.vector(length=8, dtype=wp.float32)
+_METHODS = ("l_shape", "min_area")
+_LEAST_OF_PART = 2048  # points for which a thread of their own is worth its while
 _NON_FINITE, _TOO_MANY = (wp.constant(i) for i in range(2))
 
 
@@ -43,26 +43,27 @@ def _is_finite(p: wp.vec3) -> bool:
 
 
 @wp.kernel
-def _sort_in_order(
+def _count_in_parts(
+    part: int,
+    parts: int,
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     label_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
-    # out
-    start_out: wp.array(dtype=wp.int32),
-    order_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-    dropped_out: wp.array(dtype=wp.int32),
+    # out: per part how many points each cluster has; the highest label, and what is dropped
+    place_out: wp.array2d(dtype=wp.int32),
+    tally_out: wp.array2d(dtype=wp.int32),
 ):
-    """Points by cluster, and in order within one; a counting sort by one thread."""
+    """Counts the points of each cluster in a part of the cloud."""
     n = wp.min(count_in[0], xyz_in.shape[0])
-    clusters = start_out.shape[0] - 1
-    for c in range(clusters + 1):
-        start_out[c] = 0
+    clusters = place_out.shape[1]
+    for c in range(clusters):
+        place_out[part, c] = 0
     highest = int(-1)
     non_finite = int(0)
     too_many = int(0)
-    for i in range(n):
+    share = (n + parts - 1) / parts
+    for i in range(part * share, wp.min((part + 1) * share, n)):
         label = label_in[i]
         if label >= 0:
             highest = wp.max(highest, label)
@@ -71,21 +72,69 @@ def _sort_in_order(
             elif not _is_finite(xyz_in[i]):
                 non_finite += 1
             else:
-                start_out[label + 1] = start_out[label + 1] + 1
+                place_out[part, label] = place_out[part, label] + 1
+    tally_out[part, 0] = highest
+    tally_out[part, 1] = non_finite
+    tally_out[part, 2] = too_many
+
+
+@wp.kernel
+def _add_counts(
+    parts: int,
+    # in out: counts become the places where parts put their points
+    place: wp.array2d(dtype=wp.int32),
+    # in
+    tally_in: wp.array2d(dtype=wp.int32),
+    # out
+    start_out: wp.array(dtype=wp.int32),
+    cluster_count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """One thread."""
+    clusters = place.shape[1]
+    total = int(0)
     for c in range(clusters):
-        start_out[c + 1] = start_out[c + 1] + start_out[c]
-    for i in range(n):
-        label = label_in[i]
-        if label >= 0 and label < clusters and _is_finite(xyz_in[i]):
-            order_out[start_out[label]] = i
-            start_out[label] = start_out[label] + 1
-    # Each start now stands where the next cluster begins.
-    for c in range(clusters):
-        start_out[clusters - c] = start_out[clusters - c - 1]
-    start_out[0] = 0
+        start_out[c] = total
+        for part in range(parts):
+            count = place[part, c]
+            place[part, c] = total
+            total += count
+    start_out[clusters] = total
+    highest = int(-1)
+    non_finite = int(0)
+    too_many = int(0)
+    for part in range(parts):
+        highest = wp.max(highest, tally_in[part, 0])
+        non_finite += tally_in[part, 1]
+        too_many += tally_in[part, 2]
     cluster_count_out[0] = wp.min(highest + 1, clusters)
     dropped_out[_NON_FINITE] = non_finite
     dropped_out[_TOO_MANY] = too_many
+
+
+@wp.kernel
+def _place_in_parts(
+    part: int,
+    parts: int,
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    label_in: wp.array(dtype=wp.int32),
+    count_in: wp.array(dtype=wp.int32),
+    # in out
+    place: wp.array2d(dtype=wp.int32),
+    # out
+    point_out: wp.array(dtype=wp.vec3),
+):
+    """Copies the points in the order of their clusters, and in their own within one."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    share = (n + parts - 1) / parts
+    for i in range(part * share, wp.min((part + 1) * share, n)):
+        label = label_in[i]
+        if label >= 0 and label < place.shape[1]:
+            p = xyz_in[i]
+            if _is_finite(p):
+                point_out[place[part, label]] = p
+                place[part, label] = place[part, label] + 1
 
 
 @wp.kernel
@@ -141,188 +190,23 @@ def _find_starts(
     start_out[cluster] = low
 
 
-@wp.func
-def _score(
-    sample: wp.array2d(dtype=wp.vec2),
-    cluster: int,
-    size: int,
-    direction: wp.array(dtype=wp.vec2),
-    first: int,
-    step: int,
-    criterion: int,
-) -> _vec8:
-    """How well boxes along eight directions fit the samples of a cluster; more is better."""
-    cos = _vec8()
-    sin = _vec8()
-    directions = direction.shape[0]
-    for lane in range(8):
-        d = direction[(first + lane * step + directions) % directions]
-        cos[lane] = d[0]
-        sin[lane] = d[1]
-    low_along = _vec8(FAR)
-    low_across = _vec8(FAR)
-    high_along = _vec8(-FAR)
-    high_across = _vec8(-FAR)
-    for k in range(size):
-        p = sample[cluster, k]
-        along = cos * p[0] + sin * p[1]
-        across = cos * p[1] - sin * p[0]
-        low_along = wp.min(low_along, along)
-        high_along = wp.max(high_along, along)
-        low_across = wp.min(low_across, across)
-        high_across = wp.max(high_across, across)
-    if criterion == _AREA:
-        return wp.cw_mul(low_along - high_along, high_across - low_across)
-    closeness = _vec8()
-    one = _vec8(1.0)
-    edge = _vec8(_EDGE)
-    for k in range(size):
-        p = sample[cluster, k]
-        along = cos * p[0] + sin * p[1]
-        across = cos * p[1] - sin * p[0]
-        off_along = wp.min(along - low_along, high_along - along)
-        off_across = wp.min(across - low_across, high_across - across)
-        closeness += wp.cw_div(one, wp.max(wp.min(off_along, off_across), edge))
-    return closeness
-
-
 @wp.kernel
-def _score_widely(
-    # in
-    sample_in: wp.array2d(dtype=wp.vec2),
-    start_in: wp.array(dtype=wp.int32),
-    direction_in: wp.array(dtype=wp.vec2),
-    criterion: int,
-    # out
-    score_out: wp.array2d(dtype=_vec8),
-):
-    """The score of every fourth direction."""
-    cluster, group = wp.tid()  # pyright: ignore[reportAssignmentType]
-    size = wp.min(start_in[cluster + 1] - start_in[cluster], SAMPLES)
-    if size > 0:
-        first = group * _LANES * _STRIDE
-        score_out[cluster, group] = _score(sample_in, cluster, size, direction_in, first, _STRIDE, criterion)
-
-
-@wp.kernel
-def _choose_directions(
+def _copy_in_order(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
-    start_in: wp.array(dtype=wp.int32),
     order_in: wp.array(dtype=wp.int32),
-    sample_in: wp.array2d(dtype=wp.vec2),
-    direction_in: wp.array(dtype=wp.vec2),
-    wide_in: wp.array2d(dtype=_vec8),
-    criterion: int,
-    # out
-    chosen_out: wp.array(dtype=wp.int32),
-    origin_out: wp.array(dtype=wp.vec3),
-    reach_out: wp.array2d(dtype=wp.float32),
-):
-    """The best of the directions about the best of the first look; of equals the first. Clears the reach."""
-    cluster = wp.tid()
-    size = wp.min(start_in[cluster + 1] - start_in[cluster], SAMPLES)
-    chosen_out[cluster] = 0
-    if size == 0:
-        return
-    best = float(-FAR)
-    wide = int(0)
-    for group in range(wide_in.shape[1]):
-        scores = wide_in[cluster, group]
-        for lane in range(8):
-            if scores[lane] > best:
-                best = scores[lane]
-                wide = group * _LANES + lane
-    first = wide * _STRIDE - 4
-    close = _score(sample_in, cluster, size, direction_in, first, 1, criterion)
-    best = float(-FAR)
-    chosen = int(0)
-    for lane in range(8):
-        if close[lane] > best:
-            best = close[lane]
-            chosen = first + lane
-    directions = direction_in.shape[0]
-    chosen_out[cluster] = (chosen + directions) % directions
-    origin_out[cluster] = xyz_in[order_in[start_in[cluster]]]
-    for side in range(6):
-        reach_out[cluster, side] = -FAR
-
-
-@wp.func
-def _widen(reach: wp.array2d(dtype=wp.float32), cluster: int, side: int, distance: float):
-    """Most points widen nothing: a look is cheaper than an atomic."""
-    if distance > reach[cluster, side]:
-        wp.atomic_max(reach, cluster, side, distance)
-    if -distance > reach[cluster, side + 1]:
-        wp.atomic_max(reach, cluster, side + 1, -distance)
-
-
-@wp.kernel
-def _measure_reach(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    label_in: wp.array(dtype=wp.int32),
-    count_in: wp.array(dtype=wp.int32),
-    direction_in: wp.array(dtype=wp.vec2),
-    chosen_in: wp.array(dtype=wp.int32),
-    origin_in: wp.array(dtype=wp.vec3),
-    # in out
-    reach: wp.array2d(dtype=wp.float32),
-):
-    """How far the points of each cluster reach from its first: forward, back, left, right, up, down."""
-    i = wp.tid()
-    if i >= count_in[0]:
-        return
-    label = label_in[i]
-    if label < 0 or label >= chosen_in.shape[0]:
-        return
-    p = xyz_in[i]
-    if not _is_finite(p):
-        return
-    p = p - origin_in[label]
-    d = direction_in[chosen_in[label]]
-    _widen(reach, label, 0, d[0] * p[0] + d[1] * p[1])
-    _widen(reach, label, 2, d[0] * p[1] - d[1] * p[0])
-    _widen(reach, label, 4, p[2])
-
-
-@wp.kernel
-def _write_boxes(
-    # in
     start_in: wp.array(dtype=wp.int32),
-    direction_in: wp.array(dtype=wp.vec2),
-    chosen_in: wp.array(dtype=wp.int32),
-    origin_in: wp.array(dtype=wp.vec3),
-    reach_in: wp.array2d(dtype=wp.float32),
-    min_size: float,
     # out
-    boxes_out: wp.array2d(dtype=wp.float32),
+    point_out: wp.array(dtype=wp.vec3),
 ):
-    """Centre, sizes and yaw of each cluster, the longer side along the yaw."""
-    cluster = wp.tid()
-    if start_in[cluster + 1] == start_in[cluster]:
-        for column in range(7):
-            boxes_out[cluster, column] = wp.nan
-        return
-    middle = wp.vec3()
-    size = wp.vec3()
-    for axis in range(3):
-        ahead = reach_in[cluster, 2 * axis]
-        behind = reach_in[cluster, 2 * axis + 1]
-        middle[axis] = 0.5 * (ahead - behind)
-        size[axis] = wp.max(ahead + behind, min_size)
-    d = direction_in[chosen_in[cluster]]
-    origin = origin_in[cluster]
-    boxes_out[cluster, 0] = origin[0] + d[0] * middle[0] - d[1] * middle[1]
-    boxes_out[cluster, 1] = origin[1] + d[1] * middle[0] + d[0] * middle[1]
-    boxes_out[cluster, 2] = origin[2] + middle[2]
-    yaw = 0.5 * wp.pi * float(chosen_in[cluster]) / float(direction_in.shape[0])
-    if size[1] > size[0]:  # the length lies across
-        yaw = wp.where(chosen_in[cluster] == 0, 0.5 * wp.pi, yaw - 0.5 * wp.pi)
-    boxes_out[cluster, 3] = wp.max(size[0], size[1])
-    boxes_out[cluster, 4] = wp.min(size[0], size[1])
-    boxes_out[cluster, 5] = size[2]
-    boxes_out[cluster, 6] = yaw
+    i = wp.tid()
+    if i < start_in[start_in.shape[0] - 1]:
+        point_out[i] = xyz_in[order_in[i]]
+
+
+def _in_parts(device: str) -> bool:
+    """Whether few threads do much each, as suits a CPU, or many little."""
+    return device == DEFAULT_DEVICE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,33 +243,40 @@ class FitBoxes:
         if not self.min_size > 0:
             raise ValueError(f"min_size must be > 0 m, not {self.min_size}")
         device = resolve_device(self.device)
-        criterion, directions = _METHODS[self.method]
-        angle = np.arange(directions) * (np.pi / 2 / directions)
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
 
-        def buffer(name: str, shape: int | tuple[int, ...], dtype: type) -> None:
+        def buffer(name: str, shape: int | tuple[int, ...], dtype: Any) -> None:
             keep(name, wp.zeros(shape, dtype=dtype, device=device))
 
-        keep("_criterion", criterion)
-        keep(
-            "_direction",
-            wp.array(np.stack([np.cos(angle), np.sin(angle)], axis=1), dtype=wp.vec2, device=device),
-        )
         clusters = self.max_clusters
+        keep("_parts", thread_count() if _in_parts(device) else 0)
         buffer("_start", clusters + 1, wp.int32)
-        buffer("_order", self.capacity if device == DEFAULT_DEVICE else 2 * self.capacity, wp.int32)
-        buffer("_sample", (clusters, int(SAMPLES)), wp.vec2)
-        buffer("_wide", (clusters, directions // int(_STRIDE * _LANES)), _vec8)
-        buffer("_chosen", clusters, wp.int32)
-        buffer("_origin", clusters, wp.vec3)
-        buffer("_reach", (clusters, 6), wp.float32)
+        buffer("_point", self.capacity, wp.vec3)
         buffer("boxes", (clusters, 7), wp.float32)
         buffer("cluster_count", 1, wp.int32)
         buffer("dropped", 2, wp.int32)
-        if device != DEFAULT_DEVICE:
+        if self._parts:
+            buffer("_place", (self._parts, clusters), wp.int32)
+            buffer("_tally", (self._parts, 3), wp.int32)
+        else:
             buffer("_key", 2 * self.capacity, wp.int32)
+            buffer("_order", 2 * self.capacity, wp.int32)
+        if self.method == "min_area":
+            buffer("_flat", self.capacity, wp.vec2)
+            buffer("_corner", self.capacity, wp.vec2)
+            buffer("_pending", (self.capacity, 5), wp.float32)
+            buffer("_corner_count", self.capacity, wp.int32)
+            buffer("_height", self.capacity, wp.vec2)
+        else:
+            angle = np.arange(DIRECTIONS) * (np.pi / 2 / DIRECTIONS)
+            rays = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            keep("_direction", wp.array(rays, dtype=wp.vec2, device=device))
+            buffer("_sample", (clusters, int(SAMPLES)), wp.vec2)
+            buffer("_wide", (clusters, int(GROUPS)), Scores)
+            buffer("_chosen", clusters, wp.int32)
+            buffer("_reach", (clusters, 6), wp.float32)
 
     def launch(self, xyz: wp.array, labels: wp.array, count: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points.
@@ -400,42 +291,58 @@ class FitBoxes:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         if labels.shape[0] != n:
             raise ValueError(f"labels must have {n} entries as xyz has rows, not {labels.shape[0]}")
-        clusters, criterion = self.max_clusters, self._criterion
-        self._sort(xyz, labels, count)
-        # Where the cluster heads.
-        if criterion == int(_AREA):
-            inputs = [xyz, self._start, self._order, self._direction]
-            if self.boxes.device.is_cpu:
-                self._run(sample_extremes_in_order, clusters, inputs, [self._sample])
-            else:
-                self._run(sample_extremes, (clusters, int(SAMPLES) // 4), inputs, [self._sample])
+        parts = max(1, min(self._parts, n // _LEAST_OF_PART)) if self._parts else 0
+        self._sort(xyz, labels, count, parts)
+        if self.method == "min_area":
+            self._fit_hulls(n, parts)
         else:
-            inputs = [xyz, self._start, self._order]
-            self._run(sample_evenly, (clusters, int(SAMPLES)), inputs, [self._sample])
-        inputs = [self._sample, self._start, self._direction, criterion]
-        self._run(_score_widely, self._wide.shape, inputs, [self._wide])
-        inputs = [xyz, self._start, self._order, self._sample, self._direction, self._wide, criterion]
-        self._run(_choose_directions, clusters, inputs, [self._chosen, self._origin, self._reach])
-        # How far it reaches.
-        inputs = [xyz, labels, count, self._direction, self._chosen, self._origin, self._reach]
-        self._run(_measure_reach, n, inputs, [])
-        inputs = [self._start, self._direction, self._chosen, self._origin, self._reach, self.min_size]
-        self._run(_write_boxes, clusters, inputs, [self.boxes])
+            self._fit_l_shapes(n, parts)
 
-    def _sort(self, xyz: wp.array, labels: wp.array, count: wp.array) -> None:
-        """Puts the points in order of their clusters."""
+    def _sort(self, xyz: wp.array, labels: wp.array, count: wp.array, parts: int) -> None:
+        """Puts the points in the order of their clusters."""
         n, clusters = xyz.shape[0], self.max_clusters
-        if self.boxes.device.is_cpu:
-            outputs = [self._start, self._order, self.cluster_count, self.dropped]
-            self._run(_sort_in_order, 1, [xyz, labels, count], outputs)
+        given = [xyz, labels, count]
+        if parts:
+            launch_parts(_count_in_parts, parts, given, [self._place, self._tally])
+            outputs = [self._start, self.cluster_count, self.dropped]
+            self._run(_add_counts, 1, [parts, self._place, self._tally], outputs)
+            launch_parts(_place_in_parts, parts, given, [self._place, self._point])
             return
         self.cluster_count.zero_()
         self.dropped.zero_()
-        inputs = [xyz, labels, count, clusters, self.cluster_count, self.dropped]
+        inputs = [*given, clusters, self.cluster_count, self.dropped]
         self._run(_key_points, n, inputs, [self._key, self._order])
         if n:
             wp.utils.radix_sort_pairs(self._key, self._order, n, end_bit=clusters.bit_length())
         self._run(_find_starts, clusters + 1, [self._key, n], [self._start])
+        self._run(_copy_in_order, n, [xyz, self._order, self._start], [self._point])
+
+    def _fit_hulls(self, n: int, parts: int) -> None:
+        found = [self._point, self._start]
+        room = [self._corner, self._pending]
+        hulls = [self._flat, self._corner_count, self._height]
+        rest = [self.min_size, self._flat, *room, *hulls[1:]]
+        if parts:
+            launch_parts(find_hulls_in_parts, parts, [*found, *room], hulls)
+            launch_parts(fit_hulls_in_parts, parts, [*found, *rest], [self.boxes])
+        else:
+            self._run(find_hulls, -(-n // int(RUN)), [*found, *room], hulls)
+            self._run(fit_hulls, self.max_clusters, [*found, *rest], [self.boxes])
+
+    def _fit_l_shapes(self, n: int, parts: int) -> None:
+        found, clusters = [self._point, self._start], self.max_clusters
+        if parts:
+            inputs = [*found, self._direction, self.min_size, self._sample, self._wide]
+            launch_parts(fit_l_shapes_in_parts, parts, inputs, [self.boxes])
+            return
+        directed = [self._start, self._direction]
+        self._run(sample_evenly, (clusters, int(SAMPLES)), found, [self._sample])
+        self._run(score_widely, (clusters, int(GROUPS)), [self._sample, *directed], [self._wide])
+        outputs = [self._chosen, self._reach]
+        self._run(choose_directions, clusters, [self._sample, *directed, self._wide], outputs)
+        self._run(measure_reach, n, [self._point, self._key, *directed, self._chosen], [self._reach])
+        inputs = [*found, self._direction, self._chosen, self._reach, self.min_size]
+        self._run(write_boxes, clusters, inputs, [self.boxes])
 
     def _run(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -447,7 +354,7 @@ def fit_boxes(points: Any, labels: Any, *, method: str = "l_shape", min_size: fl
     Args:
         points: Positions [m], shape (n, 3 or more), floating.
         labels: The cluster of each point, 0 … k − 1, negative for none, shape (n,), integer.
-        method: `l_shape`, headings in steps of 0.94°, or `min_area`, in steps of 0.23°.
+        method: `l_shape`, headings in steps of 0.94° (Zhang, Xu, Dong, Dolan, IV 2017), or `min_area`, exact.
         min_size: Least length, width and height of a box [m]: a single point gets a cube of it, points in a line a box
             of that width.
 
