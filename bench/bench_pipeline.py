@@ -11,35 +11,31 @@ from warploom.bench.contest import record_figure
 from warploom.bench.long_run import cycled
 from warploom.bench.scans import REAL
 from warploom.components.pipeline import Pipeline
-from warploom.errors import ModelError
+from warploom.errors import ConfigError, ModelError
 
 FRAMES = 60
 LONG_RUN = 1000
 
 
+def pipeline_of(profile):
+    try:
+        return Pipeline.from_profile(profile)
+    except (ModelError, ConfigError) as error:
+        pytest.skip(f"the profile {profile} cannot run: {error}")
+
+
 @pytest.fixture
 def pipeline():
-    try:
-        made = Pipeline.from_profile("cpu")
-    except ModelError as error:
-        pytest.skip(f"the profile cpu cannot run: {error}")
-    with made:
+    with pipeline_of("cpu") as made:
         yield made
 
 
 @pytest.mark.parametrize("scan", ["street", REAL])
 def bench_frame(benchmark, contest, pipeline, scan):
     """Frame after frame through the profile `cpu`, head included, one at a time."""
-    scans = [frame.points for frame in contest.scans.street] if scan == "street" else [contest.cloud(scan)]
-    frames = pipeline.run(cycled(scans, FRAMES + 10))
-    taken = []
-    benchmark.extra_info.update(kernel="frame", on=scan)
-    benchmark.pedantic(lambda: taken.append(next(frames)), rounds=FRAMES, warmup_rounds=10)
-    taken = taken[-FRAMES:]
-    frames.close()
-    assert not any(frame.failed for frame in taken)
-    points = np.median([len(frame.points) for frame in taken])
+    taken = some_frames(benchmark, contest, pipeline, scan)
     total = [frame.latency.total_ms for frame in taken]
+    points = np.median([len(frame.points) for frame in taken])
     record_figure(
         benchmark, f"whole frame, {scan}, median", np.median(total), "ms", goal=100.0, note=f"{points:,.0f} points"
     )
@@ -52,6 +48,27 @@ def bench_frame(benchmark, contest, pipeline, scan):
         }
         for name in names
     }
+
+
+def bench_frame_in_taichi(benchmark, contest):
+    """The same through the profile `taichi-cpu`."""
+    with pipeline_of("taichi-cpu") as pipeline:
+        taken = some_frames(benchmark, contest, pipeline, "street")
+    total = np.median([frame.latency.total_ms for frame in taken])
+    record_figure(benchmark, "whole frame, street, profile taichi-cpu, median", total, "ms", note=f"of {FRAMES} frames")
+
+
+def some_frames(benchmark, contest, pipeline, scan):
+    """Times frames one at a time, after a few that are not counted."""
+    scans = [frame.points for frame in contest.scans.street] if scan == "street" else [contest.cloud(scan)]
+    frames = pipeline.run(cycled(scans, FRAMES + 10))
+    taken = []
+    benchmark.extra_info.update(kernel="frame", on=scan)
+    benchmark.pedantic(lambda: taken.append(next(frames)), rounds=FRAMES, warmup_rounds=10)
+    taken = taken[-FRAMES:]
+    frames.close()
+    assert not any(frame.failed for frame in taken)
+    return taken
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import warp as wp
 from warploom.bench.contest import record_figure
 from warploom.components.pipeline import Pipeline
 from warploom.errors import ModelError
+from warploom.kernels.threads import launch_parts, thread_count
 
 COMMAND = "from warploom.cli import main; main()"
 REPEATS = 5
@@ -23,6 +24,11 @@ REPEATS = 5
 def _add_one(values: wp.array(dtype=wp.int32)):
     i = wp.tid()
     values[i] = values[i] + 1
+
+
+@wp.kernel
+def _add_one_in_part(part: int, parts: int, values: wp.array(dtype=wp.int32)):
+    values[part] = values[part] + parts
 
 
 def in_process(*arguments, cache=None):
@@ -87,6 +93,19 @@ def bench_first_frame(benchmark, scans, tmp_path):
         note=f"median of {REPEATS}; the frame is there {first_frame():.2f} s after the imports",
     )  # fmt: skip
     shutil.rmtree(cache)
+
+
+def bench_launch_parts(benchmark):
+    """One launch in as many parts as there may be threads, all at once, beside one in one part."""
+    parts = thread_count()
+    if parts == 1:
+        pytest.skip("one CPU thread is all that there is")
+    values = wp.zeros(parts, dtype=wp.int32, device="cpu")
+    benchmark.extra_info.update(kernel="launch in parts", on="cpu")
+    benchmark(launch_parts, _add_one_in_part, parts, [values])
+    if benchmark.stats is not None:
+        micros = benchmark.stats.stats.median * 1e6
+        record_figure(benchmark, f"launch of a kernel in {parts} parts at once, cpu", micros, "µs", note="median")
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])

@@ -158,7 +158,7 @@ def _measure(written: Path, filters: Sequence[str], device: str, quick: bool) ->
     """Runs pytest in this process; what went wrong."""
     import pytest
 
-    seconds, rounds = ("0.1", "3") if quick else ("0.5", "5")
+    seconds, rounds = ("0.1", "3") if quick else ("0.4", "5")
     said = io.StringIO()
     with tempfile.TemporaryDirectory() as folder, _progress() as progress:
         settings = Path(folder) / "pytest.ini"  # else pytest would take the settings of whoever called
