@@ -18,6 +18,7 @@ from ..errors import ConfigError
 from .component import DataProcessComponent
 from .configuration import nearest
 from .process import Process
+from .triggering import AllTrigger
 
 __all__ = ["Difference", "Replay", "ReplayResult", "produced_topics"]
 
@@ -210,9 +211,12 @@ def _triggered_by(process: Process, topic: str) -> list[str]:
     while waiting:
         at = waiting.pop()
         for component in process.components.values():
-            if not isinstance(component, DataProcessComponent) or component.trigger_input is None:
+            if not isinstance(component, DataProcessComponent):
                 continue
-            if component.inputs[component.trigger_input].topic == at:
+            # Several inputs that trigger together do so at the versions of the first.
+            together = isinstance(component._source, AllTrigger)
+            names = component.trigger_inputs[:1] if together else component.trigger_inputs
+            if at in [component.inputs[name].topic for name in names]:
                 topics = [output.topic for output in component.outputs.values() if output.topic not in reached]
                 reached.update(dict.fromkeys(topics))
                 waiting += topics

@@ -21,13 +21,15 @@ class TrackingProcessor(Processor):
     def init(self, config: ProcessorConfig) -> None:
         """Starts without tracks."""
         self._tracker = Tracker()
+        self._epoch: int | None = None
 
     def process(self, trigger: Trigger) -> Status:
         """Takes up the detections of one frame."""
         detected = self.detected.value
         sensor, detections = detected.sensor, detected.detections
-        if not sensor.continues:
+        if not sensor.continues or trigger.epoch != self._epoch:
             self._tracker.clear()
+            self._epoch = trigger.epoch
         tracks = self._tracker.update(
             sensor.version,
             detections.boxes,

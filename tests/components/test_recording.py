@@ -1,0 +1,112 @@
+"""The pipeline recorded, played and replayed: every commit again to the bit, on any number of workers."""
+
+import json
+
+import numpy as np
+import pytest
+
+import warploom as wl
+from warploom.components.messages import Obstacles, PointLabels, SensorFrame
+from warploom.components.pipeline import LIDAR_TOPIC, OBSTACLES_TOPIC, POINTS_TOPIC
+from warploom.components.recording import play_recording, record_source, replay_lines, replay_recording
+from warploom.datamesh.messages import encode
+from warploom.datamesh.recording_reader import Recording
+from warploom.errors import ConfigError, SourceError
+
+SOURCE = "sim:street?seed=7&duration=1.0"
+WORKERS = (1, 2, 8)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """The main job on one second of the simulator, recorded."""
+    path = tmp_path_factory.mktemp("recording") / "street.mcap"
+    summary = record_source(SOURCE, path, settings=["perception.cluster.min_size=9"])
+    assert (summary.frames, summary.commits, summary.dropped, summary.failure) == (10, 40, {}, None)
+    assert summary.losses == {}
+    return path
+
+
+def test_every_message_of_the_pipeline_comes_back_to_the_bit(street):
+    recording = Recording(street)
+    frames = list(wl.read(SOURCE))
+    values = {(event.topic, event.version): event.value for event in recording}
+    for frame in frames:
+        sensor = values[LIDAR_TOPIC, frame.version]
+        assert isinstance(sensor, SensorFrame)
+        assert encode(sensor) == encode(frame)
+        assert sensor.points.tobytes() == frame.points.tobytes()
+        assert isinstance(values[OBSTACLES_TOPIC, frame.version], Obstacles)
+        labels = values[POINTS_TOPIC, frame.version]
+        assert isinstance(labels, PointLabels)
+        assert labels.height.dtype == np.float32
+
+
+def test_the_recording_says_what_ran(street, repository):
+    recording = Recording(street)
+    assert recording.metadata["source"] == SOURCE
+    assert recording.metadata["profile"] == "cpu"
+    assert json.loads(recording.metadata["settings"]) == ["perception.cluster.min_size=9"]
+    assert "warp-lang" in json.loads(recording.metadata["versions"])
+    module = (repository / "conf" / "modules" / "perception.yaml").read_bytes()
+    assert recording.attachments["perception.yaml"] == module
+
+
+def test_the_main_job_replays_with_equal_hashes_at_1_2_and_8_workers(street):
+    results = list(replay_recording(street, workers=WORKERS))
+    assert [workers for workers, _, _ in results] == list(WORKERS)
+    for _, result, changed in results:
+        assert result.good, result.differences
+        assert result.fed == {LIDAR_TOPIC: 10}
+        assert result.equal == {"perception/detected": 10, POINTS_TOPIC: 10, OBSTACLES_TOPIC: 10}
+        assert changed == []
+
+
+def test_under_loop_and_seek_too(street, tmp_path):
+    settings = ["perception.cluster.min_size=9"]
+    summary = play_recording(
+        street, profile="cpu", settings=settings, rate=None, seek=0.45, loops=2, record=tmp_path / "looped.mcap"
+    )
+    assert summary.published == {LIDAR_TOPIC: 10}
+    assert summary.recorded.dropped == summary.recorded.losses == {}
+    epochs = [(event.epoch, event.topic) for event in Recording(tmp_path / "looped.mcap")]
+    assert [epochs.count((epoch, OBSTACLES_TOPIC)) for epoch in (0, 1)] == [5, 5]
+    for workers, result, _ in replay_recording(tmp_path / "looped.mcap", workers=WORKERS):
+        assert result.good, (workers, result.differences)
+        assert result.equal[OBSTACLES_TOPIC] == 10
+
+
+def test_another_setting_is_found_out_and_told(street):
+    ((_, result, _),) = replay_recording(street, settings=["perception.cluster.radius=0.7"])
+    assert not result.good
+    text = "\n".join(replay_lines(None, result, ["perception.yaml"]))
+    assert "NOT bit-exact" in text
+    assert "perception/points at " in text
+    assert "perception.yaml is not what it was when the recording was made" in text
+
+
+def test_a_frame_fed_at_its_own_pace_is_recorded_without_holding_it_up(tmp_path):
+    summary = record_source("sim:street?seed=3&duration=0.3", tmp_path / "a.mcap", realtime=True, topics=[LIDAR_TOPIC])
+    assert summary.commits == 3
+    assert {event.topic for event in Recording(tmp_path / "a.mcap")} == {LIDAR_TOPIC}
+
+
+def test_a_recording_without_the_sensor_cannot_be_replayed(tmp_path):
+    record_source("sim:street?seed=3&duration=0.2", tmp_path / "a.mcap", topics=[OBSTACLES_TOPIC])
+    with pytest.raises(ConfigError, match=f"the components read topic '{LIDAR_TOPIC}', which is not in it"):
+        list(replay_recording(tmp_path / "a.mcap"))
+
+
+def test_topics_and_files_that_make_no_sense_are_refused(street, tmp_path):
+    with pytest.raises(ConfigError, match=r"--topic 'lidar/pionts': no component reads or writes it; there are: lidar"):
+        record_source(SOURCE, tmp_path / "a.mcap", topics=["lidar/pionts"])
+    with pytest.raises(ConfigError, match="--source"):
+        record_source("nowhere.bin", tmp_path / "a.mcap")
+    with pytest.raises(ConfigError, match="'perception/obstacles' cannot be played: a module produces it"):
+        play_recording(street, profile="cpu", topics=[OBSTACLES_TOPIC])
+    with pytest.raises(ConfigError, match="cannot be played: it holds lidar/points, "):
+        play_recording(street, topics=["camera/front"])
+    with pytest.raises(ConfigError, match="cannot be recorded into itself"):
+        play_recording(street, record=street)
+    with pytest.raises(SourceError, match="No such file"):
+        list(replay_recording(tmp_path / "absent.mcap"))
