@@ -16,14 +16,18 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
+from .parts import part_start, parts_for, run_parts
 from .plan import capacity_for, plan_for
-from .voxel_grid import VoxelGrid, cell_number, grid_of, slot_of, voxel_of, write_coords
+from .voxel_grid import VoxelGrid, grid_of, voxel_of, write_coords
+from .voxel_order import VoxelOrder
 from .voxel_sort import VoxelSort
 
 __all__ = ["DynamicVoxelize", "DynamicVoxels", "dynamic_voxelize"]
 
 # Which cell a point falls into, and a sum, must not hang on whether a compiler fuses multiplications and additions.
 wp.set_module_options({"fuse_fp": False})
+
+_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
 
 
 @wp.func
@@ -35,68 +39,77 @@ def _column_of(
     return wp.float64(extra[point, column - 3])
 
 
-@wp.kernel
-def _gather_in_order(
+@wp.func_native("""
+    const int others = extra_in.shape[1], columns = 3 + others;
+    const long long nx = grid.cells[0], ny = grid.cells[1];
+    const long long step = xyz_in.strides[0] / 4, step_other = extra_in.strides[0] / 4;
+    const float* __restrict xyz = (const float*)xyz_in.data;
+    const float* __restrict extra = extra_in.data;
+    const bool four_together = columns == 4 && step == step_other && extra == xyz + 3;
+    for (int row = first; row < last; ++row) {
+        const int all = counts_in.data[row];
+        const int* __restrict point = point_in.data + end_in.data[row] - all;
+        float* __restrict to = means_out.data + (long long)row * columns;
+        const double n = (double)all;
+        if (four_together) {
+            double total[4] = {};
+            for (int k = 0; k < all; ++k)
+                for (int column = 0; column < 4; ++column) total[column] += (double)xyz[step * point[k] + column];
+            for (int column = 0; column < 4; ++column) to[column] = (float)(total[column] / n);
+        } else
+            for (int column = 0; column < columns; ++column) {
+                const float* __restrict from = column < 3 ? xyz + column : extra + column - 3;
+                const long long stride = column < 3 ? step : step_other;
+                double total = 0.0;
+                for (int k = 0; k < all; ++k) total += (double)from[stride * point[k]];
+                to[column] = (float)(total / n);
+            }
+        const long long cell = cell_of_row_in.data[row], rest = cell / nx;
+        coords_out.data[3 * row] = (int)(rest / ny);
+        coords_out.data[3 * row + 1] = (int)(rest % ny);
+        coords_out.data[3 * row + 2] = (int)(cell % nx);
+    }
+""")
+def _average_rows(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     extra_in: wp.array2d(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
     grid: VoxelGrid,
-    # in out: table of voxels, -1 where free, and left so
-    table: wp.array(dtype=wp.int32),
-    slot_of_row: wp.array(dtype=wp.int32),
-    cell_of_row: wp.array(dtype=wp.int64),
-    sums: wp.array2d(dtype=wp.float64),
+    counts_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.int32),
+    cell_of_row_in: wp.array(dtype=wp.int64),
+    first: int,
+    last: int,
     # out
-    voxel_of_point_out: wp.array(dtype=wp.int32),
     coords_out: wp.array2d(dtype=wp.int32),
-    counts_out: wp.array(dtype=wp.int32),
     means_out: wp.array2d(dtype=wp.float32),
-    voxel_count_out: wp.array(dtype=wp.int32),
-    outside_out: wp.array(dtype=wp.int32),
 ):
-    """One thread, point after point: adds each to its voxel; then the means, voxel after voxel."""
-    mask = table.shape[0] - 1
-    columns = sums.shape[1]
-    voxels = int(0)
-    outside = int(0)
-    row = int(-1)
-    before = wp.vec3i(-1, -1, -1)
-    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        voxel = voxel_of(xyz_in[i], grid)
-        if voxel[0] < 0:
-            outside += 1
-            voxel_of_point_out[i] = -1
-        else:
-            # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if ((voxel[0] ^ before[0]) | (voxel[1] ^ before[1]) | (voxel[2] ^ before[2])) != 0:
-                before = voxel
-                cell = cell_number(voxel, grid)
-                slot = slot_of(cell, mask)
-                row = table[slot]
-                while row >= 0 and cell_of_row[row] != cell:
-                    slot = (slot + 1) & mask
-                    row = table[slot]
-                if row < 0:
-                    row = voxels
-                    voxels += 1
-                    table[slot] = row
-                    slot_of_row[row] = slot
-                    cell_of_row[row] = cell
-                    counts_out[row] = 0
-                    write_coords(voxel, row, coords_out)
-                    for column in range(columns):
-                        sums[row, column] = wp.float64(0.0)
-            voxel_of_point_out[i] = row
-            counts_out[row] = counts_out[row] + 1
-            for column in range(columns):
-                sums[row, column] = sums[row, column] + _column_of(xyz_in, extra_in, i, column)
-    for v in range(voxels):
-        table[slot_of_row[v]] = -1
-        for column in range(columns):
-            means_out[v, column] = float(sums[v, column] / wp.float64(counts_out[v]))
-    voxel_count_out[0] = voxels
-    outside_out[0] = outside
+    """Means and coordinates of the voxels first … last − 1."""
+
+
+@wp.kernel
+def _average_in_order(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    extra_in: wp.array2d(dtype=wp.float32),
+    grid: VoxelGrid,
+    counts_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.int32),
+    cell_of_row_in: wp.array(dtype=wp.int64),
+    voxels_in: wp.array(dtype=wp.int32),
+    # out
+    coords_out: wp.array2d(dtype=wp.int32),
+    means_out: wp.array2d(dtype=wp.float32),
+):
+    """Means and coordinates of one of the parts that the voxels are cut into."""
+    _average_rows(
+        xyz_in, extra_in, grid, counts_in, end_in, point_in, cell_of_row_in,
+        part_start(voxels_in[0], part, parts), part_start(voxels_in[0], part + 1, parts), coords_out, means_out,
+    )  # fmt: skip
 
 
 @wp.kernel
@@ -175,7 +188,9 @@ class DynamicVoxelize:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. Results are equal."""
+    """`in_order` (in parts), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. Results are equal."""
+    parts: int | None = None
+    """How many parts are averaged at once, by the method `in_order`; by default as the threads are worth it."""
 
     voxel_of_point: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (capacity,), int32: the row of each point's voxel, or -1; as many set as points were given."""
@@ -198,6 +213,8 @@ class DynamicVoxelize:
                 raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
         if self.method not in ("auto", "in_order", "sort"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'sort', not {self.method!r}")
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts must be at least 1, not {self.parts}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
 
@@ -211,17 +228,17 @@ class DynamicVoxelize:
         keep("_sequential", sequential)
         buffer("voxel_of_point", self.capacity, wp.int32)
         buffer("coords", (self.capacity, 3), wp.int32)
-        buffer("counts", self.capacity, wp.int32)
         buffer("means", (self.capacity, self.columns), wp.float32)
-        keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("outside", wp.zeros(1, dtype=wp.int32, device=device))
         if sequential:
-            keep("_table", wp.full(2 << (self.capacity - 1).bit_length(), -1, dtype=wp.int32, device=device))
-            buffer("_slot_of_row", self.capacity, wp.int32)
-            buffer("_cell_of_row", self.capacity, wp.int64)
-            buffer("_sums", (self.capacity, self.columns), wp.float64)
+            keep("_ordered", VoxelOrder(grid, self.capacity, device, self.parts))
+            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            keep("counts", self._ordered.counts)
+            keep("voxel_count", self._ordered.voxels[:1])
         else:
             keep("_sorted", VoxelSort(grid, self.capacity, device))
+            buffer("counts", self.capacity, wp.int32)
+            keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
 
     def launch(self, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -241,14 +258,17 @@ class DynamicVoxelize:
             wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
 
         if self._sequential:
-            run(
-                _gather_in_order,
-                1,
-                [xyz, extra, count, self._grid],
+            by_voxel = self._ordered
+            by_voxel.launch(xyz, count, self.outside, self.voxel_of_point)
+            run_parts(
+                _average_in_order,
+                self._parts,
+                self.device,
                 [
-                    *(self._table, self._slot_of_row, self._cell_of_row, self._sums),
-                    *(self.voxel_of_point, self.coords, self.counts, self.means, self.voxel_count, self.outside),
+                    *(xyz, extra, self._grid, by_voxel.counts, by_voxel.end, by_voxel.point),
+                    *(by_voxel.cell_of_row, by_voxel.voxels),
                 ],
+                [self.coords, self.means],
             )
             return
         self.outside.zero_()

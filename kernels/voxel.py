@@ -1,9 +1,8 @@
 """Voxelization, hard and with fixed capacities: the first points of each voxel, as networks for point clouds want them.
 
 First come, first served: voxels are numbered by the lowest index of a point in them, and keep their first points in
-the order of the input. A CPU does just that, in one pass over a dense grid, or a hash table where a grid would be too
-large, and clears a voxel when it is met first, just before it is written. A GPU gets the same bytes from a stable sort
-by cell.
+the order of the input. A CPU does just that, point after point, then writes the voxels in parts, one after the other. A
+GPU gets the same bytes from a stable sort by cell.
 """
 
 from __future__ import annotations
@@ -18,8 +17,10 @@ import warp as wp
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
+from .parts import part_start, parts_for, run_parts
 from .plan import capacity_for, plan_for
-from .voxel_grid import VoxelGrid, cell_number, grid_of, slot_of, voxel_of, write_coords
+from .voxel_grid import VoxelGrid, grid_of, voxel_of, write_coords
+from .voxel_order import VoxelOrder
 from .voxel_sort import VoxelSort
 
 __all__ = ["Voxelize", "Voxels", "voxelize"]
@@ -27,10 +28,7 @@ __all__ = ["Voxelize", "Voxels", "voxelize"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_LEAST_ROOM = 4096  # voxels
-_DENSE_CELLS = 1 << 22  # of 4 bytes: larger grids miss the cache more than a hash table does
-_LINE = wp.constant(16)  # floats of a cache line, which a CPU clears at once
-_line = wp.types.vector(length=16, dtype=wp.float32)
+_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
 _DROPPED_POINTS, _DROPPED_VOXELS, _OUTSIDE = (wp.constant(i) for i in range(3))
 
 
@@ -53,104 +51,117 @@ def _write_features(
         features[base + 3 + column] = extra[point, column]
 
 
-@wp.func
-def _clear(voxel: int, per_voxel: int, features: wp.array(dtype=wp.float32), lines: wp.array(dtype=_line)):
-    """Zeroes the features of a voxel."""
-    if lines:
-        per_line = per_voxel / _LINE
-        for k in range(voxel * per_line, (voxel + 1) * per_line):
-            lines[k] = _line()
-    else:
-        for k in range(voxel * per_voxel, (voxel + 1) * per_voxel):
-            features[k] = 0.0
-
-
-@wp.kernel
-def _voxelize_in_order(
+@wp.func_native("""
+    const int others = extra_in.shape[1], columns = 3 + others;
+    const long long nx = grid.cells[0], ny = grid.cells[1];
+    const long long step = xyz_in.strides[0] / 4, step_other = extra_in.strides[0] / 4;
+    const float* __restrict xyz = (const float*)xyz_in.data;
+    const float* __restrict extra = extra_in.data;
+    const bool four_together = columns == 4 && step == step_other && extra == xyz + 3;
+    constexpr int POINTS_AHEAD = 16, ROWS_AHEAD = 8;
+    const int listed = voxels > first ? end_in.data[(last < voxels ? last : voxels) - 1] : 0;
+    for (int row = first; row < last; ++row) {
+        float* __restrict to = features_out.data + (long long)row * max_points * columns;
+    #ifndef __CUDA_ARCH__
+        // Rows are too far apart, and points too scattered, for the processor to see what comes next.
+        if (row + ROWS_AHEAD < last) {
+            const int soon = filled.data ? 1 : max_points * columns;
+            for (int k = 0; k < soon; k += 16) __builtin_prefetch(to + ROWS_AHEAD * max_points * columns + k, 1);
+        }
+    #endif
+        int kept = 0;
+        if (row < voxels) {
+            const int all = counts_in.data[row];
+            const int* __restrict point = point_in.data + end_in.data[row] - all;
+            kept = all < max_points ? all : max_points;
+            counts_out.data[row] = kept;
+            const long long cell = cell_of_row_in.data[row], rest = cell / nx;
+            coords_out.data[3 * row] = (int)(rest / ny);
+            coords_out.data[3 * row + 1] = (int)(rest % ny);
+            coords_out.data[3 * row + 2] = (int)(cell % nx);
+        #ifndef __CUDA_ARCH__
+            for (int k = 0; k < kept && point + k + POINTS_AHEAD < point_in.data + listed; ++k)
+                __builtin_prefetch(xyz + step * point[k + POINTS_AHEAD]);
+        #endif
+            if (four_together)
+                for (int k = 0; k < kept; ++k)
+                    for (int column = 0; column < 4; ++column) to[4 * k + column] = xyz[step * point[k] + column];
+            else
+                for (int k = 0; k < kept; ++k) {
+                    for (int column = 0; column < 3; ++column) to[columns * k + column] = xyz[step * point[k] + column];
+                    for (int column = 0; column < others; ++column)
+                        to[columns * k + 3 + column] = extra[step_other * point[k] + column];
+                }
+        }
+        const int written = filled.data ? filled.data[row] : max_points;
+        if (filled.data) filled.data[row] = kept;
+        for (int k = kept * columns; k < written * columns; ++k) to[k] = 0.0f;
+    }
+""")
+def _write_rows(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     extra_in: wp.array2d(dtype=wp.float32),
-    count_in: wp.array(dtype=wp.int32),
     grid: VoxelGrid,
-    dense: int,
+    counts_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.int32),
+    cell_of_row_in: wp.array(dtype=wp.int64),
+    max_points: int,
+    voxels: int,
+    first: int,
+    last: int,
+    # in out
+    filled: wp.array(dtype=wp.int32),
+    # out
+    features_out: wp.array(dtype=wp.float32),
+    coords_out: wp.array2d(dtype=wp.int32),
+    counts_out: wp.array(dtype=wp.int32),
+):
+    """Writes the rows first … last − 1, each from its first number to its last."""
+
+
+@wp.kernel
+def _write_voxels(
+    # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    extra_in: wp.array2d(dtype=wp.float32),
+    grid: VoxelGrid,
+    counts_in: wp.array(dtype=wp.int32),
+    end_in: wp.array(dtype=wp.int32),
+    point_in: wp.array(dtype=wp.int32),
+    cell_of_row_in: wp.array(dtype=wp.int64),
+    voxels_in: wp.array(dtype=wp.int32),
     max_points: int,
     max_voxels: int,
-    # in out: table of voxel numbers, -1 where free; what the launch before has put there, and how many voxels it has
-    # filled, or null where the features are new
-    table: wp.array(dtype=wp.int32),
-    slot_of_voxel: wp.array(dtype=wp.int32),
-    cell_of_voxel: wp.array(dtype=wp.int64),
-    numbered: wp.array(dtype=wp.int32),
+    # in out: points that the launch before has left in each row, or null where features are new
     filled: wp.array(dtype=wp.int32),
-    # out: the features twice, the second time in lines, or null where a voxel is not a whole number of them
+    # out
     features_out: wp.array(dtype=wp.float32),
-    lines_out: wp.array(dtype=_line),
     coords_out: wp.array2d(dtype=wp.int32),
     counts_out: wp.array(dtype=wp.int32),
     voxel_count_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
 ):
-    """One thread, point after point. Clears a voxel when it is met first, when it is about to be written."""
-    per_voxel = max_points * (extra_in.shape[1] + 3)
-    room = features_out.shape[0] / per_voxel
-    for old in range(numbered[0]):
-        table[slot_of_voxel[old]] = -1
-    mask = table.shape[0] - 1
-    voxels = int(0)
-    crowded = int(0)
-    outside = int(0)
-    row = int(-1)
-    before = wp.vec3i(-1, -1, -1)
-    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        voxel = voxel_of(xyz_in[i], grid)
-        if voxel[0] < 0:
-            outside += 1
-        else:
-            # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if ((voxel[0] ^ before[0]) | (voxel[1] ^ before[1]) | (voxel[2] ^ before[2])) != 0:
-                before = voxel
-                slot = int(0)
-                cell = wp.int64(0)
-                if dense != 0:
-                    slot = (voxel[2] * grid.cells[1] + voxel[1]) * grid.cells[0] + voxel[0]
-                    row = table[slot]
-                else:
-                    cell = cell_number(voxel, grid)
-                    slot = slot_of(cell, mask)
-                    row = table[slot]
-                    while row >= 0 and cell_of_voxel[row] != cell:
-                        slot = (slot + 1) & mask
-                        row = table[slot]
-                if row < 0:
-                    row = voxels
-                    voxels += 1
-                    table[slot] = row
-                    slot_of_voxel[row] = slot
-                    if dense == 0:
-                        cell_of_voxel[row] = cell
-                    if row < max_voxels:
-                        counts_out[row] = 0
-                        write_coords(voxel, row, coords_out)
-                        if row < room:
-                            _clear(row, per_voxel, features_out, lines_out)
-            if row < max_voxels:
-                rank = counts_out[row]
-                if rank < max_points:
-                    counts_out[row] = rank + 1
-                    if row < room:
-                        _write_features(xyz_in, extra_in, i, row * max_points + rank, features_out)
-                else:
-                    crowded += 1
-    numbered[0] = voxels
-    voxels_kept = wp.min(voxels, max_voxels)
+    """Writes one of the parts that the rows are cut into; those beyond the voxels are cleared."""
+    voxels = wp.min(voxels_in[0], max_voxels)
+    rows = voxels
     if filled:
-        for old in range(voxels_kept, filled[0]):
-            _clear(old, per_voxel, features_out, lines_out)
-        filled[0] = voxels_kept
-    voxel_count_out[0] = voxels_kept
-    dropped_out[_DROPPED_POINTS] = crowded
-    dropped_out[_DROPPED_VOXELS] = wp.max(voxels - max_voxels, 0)
-    dropped_out[_OUTSIDE] = outside
+        rows = wp.max(voxels, wp.min(voxels_in[1], max_voxels))
+    _write_rows(
+        xyz_in, extra_in, grid, counts_in, end_in, point_in, cell_of_row_in, max_points, voxels,
+        part_start(rows, part, parts), part_start(rows, part + 1, parts),
+        filled, features_out, coords_out, counts_out,
+    )  # fmt: skip
+    if part == 0:
+        crowded = int(0)
+        for row in range(voxels):
+            crowded += wp.max(counts_in[row] - max_points, 0)
+        voxel_count_out[0] = voxels
+        dropped_out[_DROPPED_POINTS] = crowded
+        dropped_out[_DROPPED_VOXELS] = voxels_in[0] - voxels
 
 
 @wp.kernel
@@ -217,7 +228,9 @@ class Voxelize:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. Results are equal."""
+    """`in_order` (in parts), `sort` (parallel), or `auto`: `in_order` on a CPU, else `sort`. Results are equal."""
+    parts: int | None = None
+    """How many parts are written at once, by the method `in_order`; by default as the threads are worth it."""
 
     features: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (max_voxels, max_points, columns), float32; zero where a voxel has no point."""
@@ -243,6 +256,8 @@ class Voxelize:
             )
         if self.method not in ("auto", "in_order", "sort"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'sort', not {self.method!r}")
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts must be at least 1, not {self.parts}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
 
@@ -261,18 +276,12 @@ class Voxelize:
         keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("dropped", wp.zeros(3, dtype=wp.int32, device=device))
         if sequential:
-            dense = grid.total <= _DENSE_CELLS
-            slots = int(grid.total) if dense else 2 << (self.capacity - 1).bit_length()
-            keep("_dense", int(dense))
-            keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
-            buffer("_slot_of_voxel", self.capacity, wp.int32)
-            buffer("_cell_of_voxel", self.capacity, wp.int64)
-            keep("_numbered", wp.zeros(1, dtype=wp.int32, device=device))
-            keep("_filled", wp.zeros(1, dtype=wp.int32, device=device))
-            keep("_room", [min(self.max_voxels, _LEAST_ROOM)])  # voxels that the function face expects
+            keep("_ordered", VoxelOrder(grid, self.capacity, device, self.parts))
+            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            keep("_filled", wp.zeros(self.max_voxels, dtype=wp.int32, device=device))
         else:
             keep("_sorted", VoxelSort(grid, self.capacity, device))
-            keep("_outside", self.dropped[int(_OUTSIDE) :])
+        keep("_outside", self.dropped[int(_OUTSIDE) :])
 
     def launch(self, xyz: wp.array, count: wp.array, extra: wp.array | None = None) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -284,7 +293,8 @@ class Voxelize:
         """
         extra = self._checked(xyz, extra)
         if self._sequential:
-            self._launch_in_order(xyz, count, extra, self._features, self._filled)
+            self._ordered.launch(xyz, count, self._outside)
+            self._write(xyz, extra, self._features, self._filled)
         else:
             self._launch_sort(xyz, count, extra)
 
@@ -303,37 +313,27 @@ class Voxelize:
             raise ValueError(f"extra must have shape ({n}, {self.columns - 3}), not {extra.shape}")
         return extra
 
-    def _launch_in_order(
-        self, xyz: wp.array, count: wp.array, extra: wp.array, features: wp.array, filled: wp.array | None = None
-    ) -> None:
-        """Fills `features`, flat, as far as it reaches, and all other outputs."""
-        lines = None
-        if self.max_points * self.columns % int(_LINE) == 0:
-            lines = wp.array(ptr=features.ptr, dtype=_line, shape=features.shape[0] // int(_LINE), device=self.device)
-        wp.launch(
-            _voxelize_in_order,
-            1,
-            inputs=[xyz, extra, count, self._grid, self._dense, self.max_points, self.max_voxels],
-            outputs=[
-                *(self._table, self._slot_of_voxel, self._cell_of_voxel, self._numbered, filled, features, lines),
-                *(self.coords, self.counts, self.voxel_count, self.dropped),
+    def _write(self, xyz: wp.array, extra: wp.array, features: wp.array, filled: wp.array | None = None) -> None:
+        """Writes the voxels that are numbered by now: `features`, flat, and all other outputs."""
+        by_voxel = self._ordered
+        run_parts(
+            _write_voxels,
+            self._parts,
+            self.device,
+            [
+                *(xyz, extra, self._grid, by_voxel.counts, by_voxel.end, by_voxel.point, by_voxel.cell_of_row),
+                *(by_voxel.voxels, self.max_points, self.max_voxels),
             ],
-            device=self.device,
+            [filled, features, self.coords, self.counts, self.voxel_count, self.dropped],
         )
 
     def _launch_into_new(self, xyz: wp.array, count: wp.array, extra: wp.array) -> np.ndarray:
         """In order: as `launch`, but the features are an array of their own, since they are too many to copy."""
-        room = min(self._room[0], max(xyz.shape[0], 1))
-        while True:
-            host = np.empty((room, self.max_points, self.columns), np.float32)
-            self._launch_in_order(xyz, count, extra, wp.array(host.reshape(-1), copy=False, device=DEFAULT_DEVICE))
-            voxels = int(self.voxel_count.numpy()[0])
-            if voxels <= room:
-                break
-            room = voxels
-        # A cloud like this one shall find room enough at the first try.
-        self._room[0] = min(self.max_voxels, max(_LEAST_ROOM, voxels + voxels // 8))
-        return host[:voxels]
+        self._ordered.launch(xyz, count, self._outside)
+        voxels = min(int(self._ordered.voxels.numpy()[0]), self.max_voxels)
+        host = np.empty((voxels, self.max_points, self.columns), np.float32)
+        self._write(xyz, extra, wp.array(host.reshape(-1), copy=False, device=DEFAULT_DEVICE))
+        return host
 
     def _launch_sort(self, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
         n = xyz.shape[0]

@@ -9,9 +9,8 @@ import warp as wp
 
 from .device import resolve_device  # noqa: F401  (starts Warp)
 
-__all__ = ["VoxelGrid", "cell_number", "grid_of", "slot_of", "voxel_of", "write_coords"]
+__all__ = ["VoxelGrid", "cell_number", "grid_of", "voxel_of", "write_coords"]
 
-_SPREAD = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
 _OUTSIDE = wp.constant(wp.int32(-1))
 
 
@@ -52,12 +51,6 @@ def cell_number(voxel: wp.vec3i, grid: VoxelGrid) -> wp.int64:
     return (wp.int64(voxel[2]) * wp.int64(grid.cells[1]) + wp.int64(voxel[1])) * wp.int64(grid.cells[0]) + wp.int64(
         voxel[0]
     )
-
-
-@wp.func
-def slot_of(cell: wp.int64, mask: int) -> int:
-    """Where a hash table of mask + 1 slots looks for a voxel first."""
-    return int((wp.uint64(cell) * _SPREAD) >> wp.uint64(34)) & mask
 
 
 @wp.func

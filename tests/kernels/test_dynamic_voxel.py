@@ -123,6 +123,44 @@ def test_a_million_points_in_one_voxel():
     assert_equal((found.voxel_of_point, found.coords, found.counts, found.means), reference(points, 1.0, RANGE))
 
 
+@pytest.mark.parametrize("voxel_size", [(0.4, 0.4, 4.0), (0.04, 0.04, 0.02)], ids=["dense", "hashed"])
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_methods_and_parts_give_the_same_bytes_scan_after_scan(voxel_size, columns):
+    fields = {"voxel_size": voxel_size, "point_range": RANGE, "columns": columns, "capacity": 5000}
+    ways = [{"method": "in_order", "parts": parts} for parts in (1, 2, 3, 7)] + [{"method": "sort"}]
+    plans = [DynamicVoxelize(**fields, **way) for way in ways]
+    for seed, n in enumerate((5000, 3, 0, 4000)):
+        points = borrow_points(cloud(seed, 5000, columns))
+        outputs = []
+        for plan in plans:
+            plan.launch(points.xyz, count_on(n, "cpu"), points.extra)
+            voxels = int(plan.voxel_count.numpy()[0])
+            parts = (plan.coords, plan.counts, plan.means)
+            outputs.append([part.numpy()[:voxels].tobytes() for part in parts])
+            outputs[-1].append(plan.voxel_of_point.numpy()[:n].tobytes())
+        assert all(output == outputs[0] for output in outputs)
+
+
+@pytest.mark.parametrize("kind", ["on a line", "equal", "denormal", "far", "backwards", "columns first"])
+def test_awkward_clouds(kind):
+    rng = np.random.default_rng(8)
+    points = cloud(8, 3000)
+    if kind == "on a line":
+        points[:, 1:3] = 0
+    elif kind == "equal":
+        points[:] = points[0]
+    elif kind == "denormal":
+        points[:, :3] = rng.choice([-1e-45, 0.0, 1e-45], (3000, 3))
+    elif kind == "far":
+        points[::2, :3] += rng.choice([-1e5, 1e5], (1500, 3)).astype(np.float32)
+    made = {
+        "backwards": lambda: points[::-1].copy()[::-1],
+        "columns first": lambda: np.asfortranarray(points),
+    }.get(kind, lambda: points)()
+    found = dynamic_voxelize(made, 0.16, RANGE)
+    assert_equal((found.voxel_of_point, found.coords, found.counts, found.means), reference(points, 0.16, RANGE))
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_no_point_and_one_point(n):
     found = dynamic_voxelize(np.zeros((n, 4), np.float32), 0.5, RANGE)
@@ -164,6 +202,8 @@ def test_a_plan_refuses_what_does_not_fit():
         plan.launch(wp.zeros(5, wp.vec3, device="cpu"), count_on(5, "cpu"), wp.zeros((5, 2), device="cpu"))
     with pytest.raises(ValueError, match="method must be"):
         DynamicVoxelize(capacity=10, method="fast", **fields)
+    with pytest.raises(ValueError, match="parts must be at least 1, not 0"):
+        DynamicVoxelize(capacity=10, parts=0, **fields)
 
 
 @pytest.mark.parametrize("method", ["in_order", "sort"])

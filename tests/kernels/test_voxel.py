@@ -131,6 +131,65 @@ def test_methods_agree_on_any_cloud(seed, n, max_points, max_voxels):
             np.testing.assert_array_equal(actual, wanted)
 
 
+WAYS = [{"method": "in_order", "parts": parts} for parts in (1, 2, 3, 7)] + [{"method": "sort"}]
+
+
+@pytest.mark.parametrize("voxel_size", [(0.4, 0.4, 4.0), (0.04, 0.04, 0.02)], ids=["dense", "hashed"])
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_methods_and_parts_give_the_same_bytes_scan_after_scan(voxel_size, columns):
+    fields = {"voxel_size": voxel_size, "point_range": RANGE, "max_points": 3, "max_voxels": 1500, "columns": columns}
+    plans = [Voxelize(capacity=5000, **fields, **way) for way in WAYS]
+    for seed, n in enumerate((5000, 3, 0, 4000)):
+        points = borrow_points(street(seed, 5000, columns))
+        for plan in plans:
+            plan.launch(points.xyz, count_on(n, "cpu"), points.extra)
+        voxels = int(plans[0].voxel_count.numpy()[0])
+        outputs = [
+            [plan.features.numpy().tobytes(), plan.voxel_count.numpy().tobytes(), plan.dropped.numpy().tobytes()]
+            + [part.numpy()[:voxels].tobytes() for part in (plan.coords, plan.counts)]
+            for plan in plans
+        ]
+        assert all(output == outputs[0] for output in outputs)
+
+
+@pytest.mark.parametrize(
+    "kind", ["one voxel", "on a line", "equal", "denormal", "far", "backwards", "columns first", "float64", "read-only"]
+)
+def test_awkward_clouds(kind):
+    rng = np.random.default_rng(8)
+    points = street(8, 3000)
+    if kind == "one voxel":
+        points[:, :3] = rng.uniform(0.01, 0.15, (3000, 3))
+    elif kind == "on a line":
+        points[:, 1:3] = 0
+    elif kind == "equal":
+        points[:] = points[0]
+    elif kind == "denormal":
+        points[:, :3] = rng.choice([-1e-45, 0.0, 1e-45], (3000, 3))
+    elif kind == "far":
+        points[::2, :3] += rng.choice([-1e5, 1e5], (1500, 3)).astype(np.float32)
+    made = {
+        "backwards": lambda: points[::-1].copy()[::-1],
+        "columns first": lambda: np.asfortranarray(points),
+        "float64": lambda: points.astype(np.float64),
+    }.get(kind, lambda: points)()
+    made.setflags(write=kind != "read-only")
+    voxels = voxelize(made, PILLAR, RANGE, max_points=5)
+    expected = reference(points, PILLAR, RANGE, 5, 40_000)
+    for actual, wanted in zip((voxels.features, voxels.coords, voxels.counts), expected, strict=True):
+        np.testing.assert_array_equal(actual, wanted)
+
+
+@pytest.mark.parametrize("way", [WAYS[1], WAYS[-1]], ids=str)
+def test_a_million_points_in_one_voxel(way):
+    points = np.random.default_rng(9).uniform(0.01, 0.15, (1_000_000, 4)).astype(np.float32)
+    features, coords, counts, dropped = launched(points, voxel_size=PILLAR, point_range=RANGE, max_voxels=3, **way)
+    np.testing.assert_array_equal(features, points[None, :32])
+    assert coords.tolist() == [[0, 248, 0]]
+    assert counts.tolist() == [32]
+    assert dropped == [1_000_000 - 32, 0, 0]
+
+
 def test_the_upper_bound_is_open_and_the_lower_is_not():
     points = np.array([[0, 0, 0], [1, 0.5, 0.5], [0.5, 1, 0.5], [0.5, 0.5, 1], [-1e-7, 0, 0]], np.float32)
     voxels = voxelize(points, 0.5, (0, 0, 0, 1, 1, 1))
@@ -198,6 +257,8 @@ def test_a_plan_refuses_what_does_not_fit():
         plan.launch(xyz[:5], count_on(5, "cpu"))
     with pytest.raises(ValueError, match="method must be"):
         Voxelize(voxel_size=PILLAR, point_range=RANGE, capacity=10, method="fast")
+    with pytest.raises(ValueError, match="parts must be at least 1, not 0"):
+        Voxelize(voxel_size=PILLAR, point_range=RANGE, capacity=10, parts=0)
 
 
 @pytest.mark.parametrize("method", ["in_order", "sort"])
