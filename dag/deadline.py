@@ -43,7 +43,7 @@ class FrameDeadline:
         """
         self._clock = clock
         self._on_miss = config.on_miss
-        self._due_ns = (trigger.received_ns or trigger.at_ns) + round(config.ms * 1e6)
+        self._due_ns = (trigger.received_ns or trigger.at_ns or clock.monotonic_ns()) + round(config.ms * 1e6)
         self._done = False
         self._timer = None
         if config.on_miss == "cut":

@@ -136,7 +136,7 @@ class AlignDagProcessor(Processor):
             self._waits[name] = handle.when(
                 trigger.version,
                 on_end,
-                due_ns=(trigger.at_ns or clock.monotonic_ns()) + self._timeout,
+                due_ns=(clock.monotonic_ns() if trigger.at_ns is None else trigger.at_ns) + self._timeout,
                 tolerance_ns=self._tolerance,
                 epoch=trigger.epoch,
             )

@@ -24,8 +24,8 @@ class Trigger(NamedTuple):
     """True: there will be nothing at this version; the component passes that on instead of running."""
     epoch: int = CURRENT_EPOCH
     """Order is by epoch, then version."""
-    at_ns: int = 0
-    """The clock's `monotonic_ns` when the trigger came: deadlines of waits count from here."""
+    at_ns: int | None = None
+    """The clock's `monotonic_ns` when the trigger came: deadlines of waits count from here; None is now."""
     inputs: Mapping[str, int] = MappingProxyType({})
     """The versions that triggered, by input: several where `all` puts them together within a tolerance."""
 
