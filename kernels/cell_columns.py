@@ -17,6 +17,7 @@ import warp as wp
 from .cell_pairs import Radius, cell_of, is_finite, level_of_x, x_of_level
 from .device import DEFAULT_DEVICE
 from .threads import launch_parts, thread_count
+from .unchecked import at, put
 
 __all__ = ["CellColumns", "Layout", "parts_for", "row_of"]
 
@@ -131,7 +132,7 @@ def _find_cells(
             usable = include_in[i] != wp.uint8(0)
         if usable:
             cell = cell_of(point, radius)
-            cells_out[i] = cell
+            put(cells_out, i, cell)
             x = cell[0]
             level = int(0)
             if radius.per_metre > wp.float64(0.0):
@@ -146,8 +147,8 @@ def _find_cells(
             high_z = wp.max(high_z, cell[2])
             high_level = wp.max(high_level, level)
         else:
-            cells_out[i] = wp.vec3i(_NOWHERE, 0, 0)
-            cell_of_point[i] = -1
+            put(cells_out, i, wp.vec3i(_NOWHERE, 0, 0))
+            put(cell_of_point, i, -1)
         i += 1
     bounds_out[2 * part] = wp.vec4i(low_x, low_y, low_z, low_level)
     bounds_out[2 * part + 1] = wp.vec4i(high_x, high_y, high_z, high_level)
@@ -177,25 +178,25 @@ def _count_digits(
     low_count = low_counts[part]
     high_count = high_counts[part]
     for digit in range(layout.low_digits):
-        low_count[digit] = 0
+        put(low_count, digit, 0)
     for digit in range(layout.high_digits):
-        high_count[digit] = 0
+        put(high_count, digit, 0)
     mask = (1 << layout.shift) - 1
     least_y = layout.least[1]
     least_z = layout.least[2]
     i = n * part // parts
     end = n * (part + 1) // parts
     while i < end:
-        cell = cells[i]
+        cell = at(cells, i)
         low = int(-1)
         high = int(-1)
         if cell[0] != _NOWHERE:
             column = row_of(cell[0], layout, 0) * layout.depth + cell[1] - least_y
             low = (column & mask) * layout.height + cell[2] - least_z
             high = column >> layout.shift
-            low_count[low] = low_count[low] + 1
-            high_count[high] = high_count[high] + 1
-        digits_out[i] = wp.vec2i(low, high)
+            put(low_count, low, at(low_count, low) + 1)
+            put(high_count, high, at(high_count, high) + 1)
+        put(digits_out, i, wp.vec2i(low, high))
         i += 1
 
 
@@ -277,18 +278,18 @@ def _sort_low(
     for digit in range(layout.low_digits):
         for other in range(parts):
             if other == part:
-                place[digit] = begin
+                put(place, digit, begin)
             begin += low_counts[other, digit]
     if part == 0:
         used_out[0] = begin
     i = n * part // parts
     end = n * (part + 1) // parts
     while i < end:
-        both = digits[i]
+        both = at(digits, i)
         if both[0] >= 0:
-            at = place[both[0]]
-            place[both[0]] = at + 1
-            by_low[at] = wp.vec2i(both[1], i)
+            place_of = at(place, both[0])
+            put(place, both[0], place_of + 1)
+            put(by_low, place_of, wp.vec2i(both[1], i))
         i += 1
 
 
@@ -338,7 +339,7 @@ def _sort_high(
         place = next_place[part]
         first = int(_MOST)
         last = int(-1)
-        at = int(0)
+        place_of = int(0)
         # A digit is of the part in whose share of the points it begins.
         least = used * part // parts
         most = used * (part + 1) // parts
@@ -346,21 +347,21 @@ def _sort_high(
             size = int(0)
             for other in range(parts):
                 size += high_counts[other, digit]
-            if at >= least and at < most and size > 0:
+            if place_of >= least and place_of < most and size > 0:
                 if last < 0:
                     first = digit
-                    begin = at
+                    begin = place_of
                 last = digit
-                end = at + size
-                place[digit] = at
-            at += size
+                end = place_of + size
+                put(place, digit, place_of)
+            place_of += size
         k = int(0)
         while k < used:
-            entry = by_low[k]
+            entry = at(by_low, k)
             if entry[0] >= first and entry[0] <= last:
-                at = place[entry[0]]
-                place[entry[0]] = at + 1
-                order[at] = entry[1]
+                place_of = at(place, entry[0])
+                put(place, entry[0], place_of + 1)
+                put(order, place_of, entry[1])
             k += 1
     # Each part leaves a place free after its cells, for where the last one ends.
     c = begin + part - 1
@@ -369,16 +370,16 @@ def _sort_high(
     y = int(0)
     z = int(0)
     column_begin = int(0)
-    at = begin
+    place_of = begin
     # Without a branch the processor has many of these on their way at once.
-    while at < end:
-        i = order[at]
-        points[at] = xyz_in[i]
-        sorted_cells[at] = cells[i]
-        at += 1
-    at = begin
-    while at < end:
-        cell = sorted_cells[at]
+    while place_of < end:
+        i = at(order, place_of)
+        put(points, place_of, xyz_in[i])
+        put(sorted_cells, place_of, at(cells, i))
+        place_of += 1
+    place_of = begin
+    while place_of < end:
+        cell = at(sorted_cells, place_of)
         if cell[0] != x or cell[1] != y:
             if k >= begin:
                 columns[k] = wp.vec4i(x, y, column_begin, c + 1)
@@ -388,16 +389,16 @@ def _sort_high(
             y = cell[1]
             z = cell[2]
             column_begin = c
-            stacks[c] = wp.vec2i(z, at)
+            put(stacks, c, wp.vec2i(z, place_of))
         elif cell[2] != z:
             c += 1
             z = cell[2]
-            stacks[c] = wp.vec2i(z, at)
-        cell_of_point[order[at]] = c
-        at += 1
+            put(stacks, c, wp.vec2i(z, place_of))
+        put(cell_of_point, at(order, place_of), c)
+        place_of += 1
     if end > begin:
         columns[k] = wp.vec4i(x, y, column_begin, c + 1)
-        stacks[c + 1] = wp.vec2i(0, end)
+        put(stacks, c + 1, wp.vec2i(0, end))
     ranges[part] = wp.vec4i(begin + part, c + 1, begin, k + 1)
 
 

@@ -15,6 +15,7 @@ import math
 import warp as wp
 
 from .device import resolve_device  # noqa: F401  (starts Warp)
+from .unchecked import at
 
 __all__ = [
     "Radius",
@@ -253,10 +254,10 @@ def _touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: i
     near = bool(False)
     i = int(a_begin)
     while i < a_end:
-        p = points[i]
+        p = at(points, i)
         j = int(b_begin)
         while j < b_end:
-            if is_near(p, points[j], radius):
+            if is_near(p, at(points, j), radius):
                 near = True
                 j = b_end
                 i = a_end
@@ -286,12 +287,12 @@ def touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: in
 def find(parent: wp.array(dtype=wp.int32), cell: int) -> int:
     """The root of a cell. Halves the path; a write lost to another thread leaves an ancestor all the same."""
     root = int(cell)
-    above = parent[root]
+    above = at(parent, root)
     while above != root:
-        next = parent[above]
+        next = at(parent, above)
         parent[root] = next
         root = next
-        above = parent[root]
+        above = at(parent, root)
     return root
 
 

@@ -10,6 +10,7 @@ import warp as wp
 
 from .cell_columns import Layout, row_of
 from .cell_pairs import Radius, find, hash_cell, join_levels, touch
+from .unchecked import at, put
 
 __all__ = ["join_borders", "join_levels_in_order", "join_own_columns", "label_points"]
 
@@ -26,6 +27,17 @@ _HIGH_CELL = wp.constant(wp.uint64(1 << 60))
 
 
 @wp.func
+def _cells_touch(
+    a: int,
+    b: int,
+    stacks: wp.array(dtype=wp.vec2i),
+    points: wp.array(dtype=wp.vec3),
+    radius: Radius,
+) -> bool:
+    return touch(points, at(stacks, a)[1], at(stacks, a + 1)[1], at(stacks, b)[1], at(stacks, b + 1)[1], radius)
+
+
+@wp.func
 def _join_cells(
     a: int,
     b: int,
@@ -35,11 +47,11 @@ def _join_cells(
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites two cells if they touch."""
-    if parent[a] != parent[b]:
+    if at(parent, a) != at(parent, b):
         root_a = find(parent, a)
         root_b = find(parent, b)
-        if root_a != root_b and touch(points, stacks[a][1], stacks[a + 1][1], stacks[b][1], stacks[b + 1][1], radius):
-            parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
+        if root_a != root_b and _cells_touch(a, b, stacks, points, radius):
+            put(parent, wp.max(root_a, root_b), wp.min(root_a, root_b))
 
 
 @wp.func
@@ -56,12 +68,12 @@ def _join_heights(
     """Unites those cells of two columns that touch, of those whose z differ by `least` … `most`."""
     low = int(there[2])
     for a in range(here[2], here[3]):
-        z = stacks[a][0]
-        while low < there[3] and stacks[low][0] < z - most:
+        z = at(stacks, a)[0]
+        while low < there[3] and at(stacks, low)[0] < z - most:
             low += 1
         b = int(low)
-        while b < there[3] and stacks[b][0] <= z + most:
-            if wp.abs(stacks[b][0] - z) >= least:
+        while b < there[3] and at(stacks, b)[0] <= z + most:
+            if wp.abs(at(stacks, b)[0] - z) >= least:
                 _join_cells(a, b, stacks, points, radius, parent)
             b += 1
 
@@ -77,7 +89,7 @@ def _join_second_next(
     """Unites those cells of a column that touch, of those whose z differ by two."""
     for a in range(column[2], column[3] - 1):
         for b in range(a + 1, wp.min(a + 3, column[3])):
-            if stacks[b][0] == stacks[a][0] + 2:
+            if at(stacks, b)[0] == at(stacks, a)[0] + 2:
                 _join_cells(a, b, stacks, points, radius, parent)
 
 
@@ -106,19 +118,19 @@ def _join_rows(
     """Unites cells of columns with those of others that are `dx` rows on and `least_dy` … `most_dy` aside."""
     head = int(others)
     for k in range(first, last):
-        here = columns[k]
+        here = at(columns, k)
         x = here[0] + dx
-        while head < others_end and _is_before(columns[head], x, here[1] + least_dy):
+        while head < others_end and _is_before(at(columns, head), x, here[1] + least_dy):
             head += 1
         other = int(head)
         if others == first and other <= k:
             other = k + 1
-        while other < others_end and columns[other][0] == x and columns[other][1] <= here[1] + most_dy:
-            there = columns[other]
+        while other < others_end and at(columns, other)[0] == x and at(columns, other)[1] <= here[1] + most_dy:
+            there = at(columns, other)
             if which == _ADJACENT:
                 _join_heights(here, there, 0, 0, stacks, points, radius, parent)
                 _join_heights(here, there, 1, 1, stacks, points, radius, parent)
-            elif column_root[k] < 0 or column_root[k] != column_root[other]:
+            elif at(column_root, k) < 0 or at(column_root, k) != at(column_root, other):
                 least = int(0)
                 if which == _OTHERS and dx < 2 and wp.abs(there[1] - here[1]) < 2:
                     least = 2
@@ -157,7 +169,7 @@ def _join_two_columns(
     """
     a_begin = here[2]
     b_begin = there[2]
-    apart = stacks[a_begin][0] - stacks[b_begin][0]
+    apart = at(stacks, a_begin)[0] - at(stacks, b_begin)[0]
     one = wp.uint64(1)
     step = int(first_step)
     # Where no cell is within two of another there is nothing to try.
@@ -178,7 +190,7 @@ def _join_two_columns(
             b = b_begin + int(wp.bit_count(there_mask & ((one << wp.uint64(height + by)) - one)))
             left = left & (left - one)
             _join_cells(a, b, stacks, points, radius, parent)
-            if whole and parent[a] == parent[b]:
+            if whole and at(parent, a) == at(parent, b):
                 left = wp.uint64(0)
                 step = last_step
         step += 1
@@ -221,20 +233,20 @@ def _join_neighbours(
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites cells of a column with those of its neighbours, a bit each, that touch, of ring 0 or 1."""
-    here = columns[k]
-    here_mask = masks[k]
-    root = column_root[k]
+    here = at(columns, k)
+    here_mask = at(masks, k)
+    root = at(column_root, k)
     left = int(neighbours)
     while left != 0:
         o = wp.bit_count((left & -left) - 1)
         left = left & (left - 1)
-        other = column_map[places[k] + offsets[o][0] * row_length + offsets[o][1]]
+        other = at(column_map, at(places, k) + offsets[o][0] * row_length + offsets[o][1])
         if other >= begin and other < end:
-            there_root = column_root[other]
+            there_root = at(column_root, other)
             whole = root >= 0 and there_root >= 0
             if not whole or find(parent, root) != find(parent, there_root):
-                there = columns[other]
-                there_mask = masks[other]
+                there = at(columns, other)
+                there_mask = at(masks, other)
                 first_step = int(0)
                 last_step = int(2)
                 if ring == 1:
@@ -292,32 +304,32 @@ def join_own_columns(
     # Adjacent cells of a column.
     k = begin
     while k < end:
-        column = columns[k]
+        column = at(columns, k)
         a = column[2]
         last = column[3] - 1
-        parent[a] = a
-        z = stacks[a][0]
+        put(parent, a, a)
+        z = at(stacks, a)[0]
         lowest = z
         mask = wp.uint64(1)
         root = a
         while a < last:
-            above = stacks[a + 1][0]
+            above = at(stacks, a + 1)[0]
             a += 1
-            if above == z + 1 and touch(points, stacks[a - 1][1], stacks[a][1], stacks[a][1], stacks[a + 1][1], radius):
-                parent[a] = parent[a - 1]
+            if above == z + 1 and _cells_touch(a - 1, a, stacks, points, radius):
+                put(parent, a, at(parent, a - 1))
             else:
-                parent[a] = a
+                put(parent, a, a)
                 root = -1
             z = above
             mask = mask | (wp.uint64(1) << wp.uint64((z - lowest) & 63))
         if z - lowest > 63:
             mask = wp.uint64(0)
         masks[k] = mask
-        column_root[k] = root
+        put(column_root, k, root)
         if mapped:
             place = row_of(column[0], layout, 2) * row_length + column[1] - layout.least[1] + 2
-            places[k] = place
-            column_map[place] = k
+            put(places, k, place)
+            put(column_map, place, k)
         k += 1
     # Adjacent cells of adjacent columns, then all others. One loop for both, so that what it calls is compiled in once.
     ring = int(0)
@@ -325,47 +337,48 @@ def join_own_columns(
         if ring == 1:
             c = ranges[part][0]
             while c < ranges[part][1]:
-                parent[c] = parent[parent[c]]  # the parent of a lower cell is its root by now
+                put(parent, c, at(parent, at(parent, c)))  # the parent of a lower cell is its root by now
                 c += 1
             k = begin
             while k < end:
-                a = columns[k][2]
-                last = columns[k][3] - 1
-                root = parent[a]
+                a = at(columns, k)[2]
+                last = at(columns, k)[3] - 1
+                root = at(parent, a)
                 while a < last:
                     a += 1
-                    if parent[a] != root:
+                    if at(parent, a) != root:
                         root = -1
-                column_root[k] = root
+                put(column_root, k, root)
                 if mapped:
-                    root_map[places[k]] = root
+                    put(root_map, at(places, k), root)
                 if root < 0:
-                    _join_second_next(columns[k], stacks, points, radius, parent)
+                    _join_second_next(at(columns, k), stacks, points, radius, parent)
                 k += 1
         k = begin
         while mapped and k < end:
-            at = places[k]
-            next = at + row_length
+            place = at(places, k)
+            next = place + row_length
             neighbours = int(0)
             if ring == 0:
-                neighbours = _bit_if_any(column_map[at + 1], 0) | _bit_if_any(column_map[next], 1)
-                neighbours = neighbours | _bit_if_any(column_map[next - 1], 2) | _bit_if_any(column_map[next + 1], 3)
+                neighbours = _bit_if_any(at(column_map, place + 1), 0) | _bit_if_any(at(column_map, next), 1)
+                neighbours = neighbours | _bit_if_any(at(column_map, next - 1), 2)
+                neighbours = neighbours | _bit_if_any(at(column_map, next + 1), 3)
             else:
-                own = column_root[k]
+                own = at(column_root, k)
                 if own < 0:
                     own = _NO_ROOT
                 second = next + row_length
-                neighbours = _bit_if_other(root_map[at + 1], own, 0) | _bit_if_other(root_map[next], own, 1)
-                neighbours = neighbours | _bit_if_other(root_map[next - 1], own, 2)
-                neighbours = neighbours | _bit_if_other(root_map[next + 1], own, 3)
-                neighbours = neighbours | _bit_if_other(root_map[at + 2], own, 4)
-                neighbours = neighbours | _bit_if_other(root_map[second], own, 5)
-                neighbours = neighbours | _bit_if_other(root_map[next - 2], own, 6)
-                neighbours = neighbours | _bit_if_other(root_map[next + 2], own, 7)
-                neighbours = neighbours | _bit_if_other(root_map[second - 1], own, 8)
-                neighbours = neighbours | _bit_if_other(root_map[second + 1], own, 9)
-                neighbours = neighbours | _bit_if_other(root_map[second - 2], own, 10)
-                neighbours = neighbours | _bit_if_other(root_map[second + 2], own, 11)
+                neighbours = _bit_if_other(at(root_map, place + 1), own, 0) | _bit_if_other(at(root_map, next), own, 1)
+                neighbours = neighbours | _bit_if_other(at(root_map, next - 1), own, 2)
+                neighbours = neighbours | _bit_if_other(at(root_map, next + 1), own, 3)
+                neighbours = neighbours | _bit_if_other(at(root_map, place + 2), own, 4)
+                neighbours = neighbours | _bit_if_other(at(root_map, second), own, 5)
+                neighbours = neighbours | _bit_if_other(at(root_map, next - 2), own, 6)
+                neighbours = neighbours | _bit_if_other(at(root_map, next + 2), own, 7)
+                neighbours = neighbours | _bit_if_other(at(root_map, second - 1), own, 8)
+                neighbours = neighbours | _bit_if_other(at(root_map, second + 1), own, 9)
+                neighbours = neighbours | _bit_if_other(at(root_map, second - 2), own, 10)
+                neighbours = neighbours | _bit_if_other(at(root_map, second + 2), own, 11)
             if neighbours != 0:
                 _join_neighbours(
                     k,
@@ -409,8 +422,8 @@ def join_own_columns(
         ring += 1
     k = begin
     while mapped and k < end:
-        column_map[places[k]] = -1
-        root_map[places[k]] = _NO_COLUMN
+        put(column_map, at(places, k), -1)
+        put(root_map, at(places, k), _NO_COLUMN)
         k += 1
 
 
@@ -433,11 +446,11 @@ def join_borders(
             begin = ranges[q][2]
             end = ranges[q][3]
             if begin < end:
-                x = columns[begin][0] - 2
-                y = columns[begin][1] - 2
+                x = at(columns, begin)[0] - 2
+                y = at(columns, begin)[1] - 2
                 last = ranges[p][3]
                 first = int(last)
-                while first > ranges[p][2] and not _is_before(columns[first - 1], x, y):
+                while first > ranges[p][2] and not _is_before(at(columns, first - 1), x, y):
                     first -= 1
                 for dx in range(3):
                     _join_rows(
@@ -467,17 +480,17 @@ def join_levels_in_order(
     mask = table.shape[0] - 1
     for p in range(ranges.shape[0]):
         for k in range(ranges[p][2], ranges[p][3]):
-            column = columns[k]
+            column = at(columns, k)
             for c in range(column[2], column[3]):
-                cell = wp.vec3i(column[0], column[1], stacks[c][0])
+                cell = wp.vec3i(column[0], column[1], at(stacks, c)[0])
                 slot = hash_cell(cell) & mask
                 while table[slot] >= 0:
                     slot = (slot + 1) & mask
                 table[slot] = c
                 slots[c] = slot
                 cells[c] = cell
-                cell_begin[c] = stacks[c][1]
-                cell_end[c] = stacks[c + 1][1]
+                cell_begin[c] = at(stacks, c)[1]
+                cell_end[c] = at(stacks, c + 1)[1]
     for p in range(ranges.shape[0]):
         for c in range(ranges[p][0], ranges[p][1]):
             join_levels(c, table, no_slots, cells, cell_begin, cell_end, points, radius, parent)
@@ -505,37 +518,37 @@ def label_points(
         c = ranges[p][0]
         end = ranges[p][1]
         while c < end:
-            root = parent[parent[c]]  # the parent of a lower cell is its root by now
-            parent[c] = root
+            root = at(parent, at(parent, c))  # the parent of a lower cell is its root by now
+            put(parent, c, root)
             before = int(0)
             if root != c:
-                before = members[root]
-            members[root] = before + stacks[c + 1][1] - stacks[c][1]
+                before = at(members, root)
+            put(members, root, before + at(stacks, c + 1)[1] - at(stacks, c)[1])
             c += 1
     for p in range(ranges.shape[0]):
         c = ranges[p][0]
         end = ranges[p][1]
         while c < end:
-            if parent[c] == c:
+            if at(parent, c) == c:
                 # Of a root nothing but its label is wanted from here on.
                 label = int(-1)
-                if members[c] >= min_size:
+                if at(members, c) >= min_size:
                     label = _UNNUMBERED
-                members[c] = label
+                put(members, c, label)
             c += 1
     clusters = int(0)
     n = labels_out.shape[0]
     i = int(0)
     while i < n:
         label = int(-1)
-        c = cell_of_point[i]
+        c = at(cell_of_point, i)
         if c >= 0:
-            root = parent[c]
-            label = members[root]
+            root = at(parent, c)
+            label = at(members, root)
             if label == _UNNUMBERED:
                 label = clusters
-                members[root] = label
+                put(members, root, label)
                 clusters += 1
-        labels_out[i] = label
+        put(labels_out, i, label)
         i += 1
     cluster_count_out[0] = clusters
