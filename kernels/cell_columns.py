@@ -19,7 +19,7 @@ from .device import DEFAULT_DEVICE
 from .threads import launch_parts, thread_count
 from .unchecked import at, put
 
-__all__ = ["CellColumns", "Layout", "parts_for", "row_of"]
+__all__ = ["LEAST_MAP", "MAP_PER_POINT", "CellColumns", "Layout", "aligned", "is_before", "parts_for", "row_of"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -31,6 +31,9 @@ _MOST_CELLS = wp.constant(wp.int64(2**31 - 1))
 _WIDE_BITS = wp.constant(11)  # of a digit of clouds too wide for two digits made to measure
 _WIDE_DIGITS = wp.constant(1 << 11)
 _POINTS_WORTH_A_THREAD = 6_000
+
+LEAST_MAP, MAP_PER_POINT = 1 << 20, 16
+"""Places that a map of columns has, at least and per point of the capacity."""
 
 
 @wp.struct
@@ -46,6 +49,23 @@ class Layout:
     shift: int  # bits of a column's number that are of the low digit
     low_digits: int
     high_digits: int  # 0 where the cloud is too wide for two digits
+
+
+@wp.func
+def aligned(mask: wp.uint64, by: int) -> wp.uint64:
+    """A mask moved by a number of heights; up to 63 of them, beyond which nothing is left."""
+    moved = wp.uint64(0)
+    if by >= 0 and by < 64:
+        moved = mask >> wp.uint64(by)
+    elif by < 0 and by > -64:
+        moved = mask << wp.uint64(-by)
+    return moved
+
+
+@wp.func
+def is_before(column: wp.vec4i, x: int, y: int) -> bool:
+    """Whether a column comes before x and y."""
+    return column[0] < x or (column[0] == x and column[1] < y)
 
 
 @wp.func

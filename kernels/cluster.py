@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from .backend import uses_taichi
-from .cell_columns import CellColumns
+from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
 from .cluster_columns import join_borders, join_levels_in_order, join_own_columns, label_points
@@ -30,7 +30,6 @@ wp.set_module_options({"fuse_fp": False})
 
 _SMALLEST_RADIUS = 1e-8
 _LEAST_GROWTH = 1e-5
-_LEAST_MAP, _MAP_PER_POINT = 1 << 20, 16  # places of the map of columns
 
 
 @wp.kernel
@@ -152,7 +151,7 @@ class EuclideanCluster:
             # The adjacent columns first, and of them those that share a side.
             flat = sorted({d[:2] for d in forward} - {(2, 2)}, key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
             keep("_offsets", wp.array(np.array(flat, np.int32) - 2, dtype=wp.vec2i, device=device))
-            places = max(_LEAST_MAP, _MAP_PER_POINT * self.capacity)
+            places = max(LEAST_MAP, MAP_PER_POINT * self.capacity)
             keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=device))
             keep("_root_map", wp.full(places, -2, dtype=wp.int32, device=device))
         else:

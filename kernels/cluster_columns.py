@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cell_columns import Layout, row_of
+from .cell_columns import Layout, aligned, is_before, row_of
 from .cell_pairs import Radius, find, hash_cell, join_levels, touch
 from .unchecked import at, put
 
@@ -94,11 +94,6 @@ def _join_second_next(
 
 
 @wp.func
-def _is_before(column: wp.vec4i, x: int, y: int) -> bool:
-    return column[0] < x or (column[0] == x and column[1] < y)
-
-
-@wp.func
 def _join_rows(
     columns: wp.array(dtype=wp.vec4i),
     first: int,
@@ -120,7 +115,7 @@ def _join_rows(
     for k in range(first, last):
         here = at(columns, k)
         x = here[0] + dx
-        while head < others_end and _is_before(at(columns, head), x, here[1] + least_dy):
+        while head < others_end and is_before(at(columns, head), x, here[1] + least_dy):
             head += 1
         other = int(head)
         if others == first and other <= k:
@@ -136,17 +131,6 @@ def _join_rows(
                     least = 2
                 _join_heights(here, there, least, 2, stacks, points, radius, parent)
             other += 1
-
-
-@wp.func
-def _aligned(mask: wp.uint64, by: int) -> wp.uint64:
-    """A mask moved by a number of heights; up to 63 of them, beyond which nothing is left."""
-    moved = wp.uint64(0)
-    if by >= 0 and by < 64:
-        moved = mask >> wp.uint64(by)
-    elif by < 0 and by > -64:
-        moved = mask << wp.uint64(-by)
-    return moved
 
 
 @wp.func
@@ -175,14 +159,14 @@ def _join_two_columns(
     # Where no cell is within two of another there is nothing to try.
     spread = here_mask | (here_mask << one)
     spread = spread | (spread << wp.uint64(2)) | (here_mask << wp.uint64(4))
-    if here_mask < _HIGH_CELL and (spread & _aligned(there_mask, apart - 2)) == wp.uint64(0):
+    if here_mask < _HIGH_CELL and (spread & aligned(there_mask, apart - 2)) == wp.uint64(0):
         step = 5
     while step <= last_step:
         by = (step + 1) >> 1
         if (step & 1) == 0:
             by = -by
         by += apart
-        left = here_mask & _aligned(there_mask, by)
+        left = here_mask & aligned(there_mask, by)
         while left != wp.uint64(0):
             lower = (left & (~left + one)) - one  # ones below the lowest one
             height = int(wp.bit_count(lower))
@@ -450,7 +434,7 @@ def join_borders(
                 y = at(columns, begin)[1] - 2
                 last = ranges[p][3]
                 first = int(last)
-                while first > ranges[p][2] and not _is_before(at(columns, first - 1), x, y):
+                while first > ranges[p][2] and not is_before(at(columns, first - 1), x, y):
                     first -= 1
                 for dx in range(3):
                     _join_rows(

@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .cell_pairs import Radius, cell_of, differ, find, hash_cell, is_finite, unite
+from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns
+from .cell_pairs import Radius, unite
 from .cell_table import CellTable, cell_at
+from .cluster_columns import label_points
 from .device import DEFAULT_DEVICE, resolve_device
+from .grid_columns import join_border_voxels, join_own_voxels
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
 
@@ -37,91 +40,6 @@ def _neighbour(cell: wp.vec3i, offset: wp.vec3i) -> wp.vec3i:
         if offset[axis] != 0 and (wp.abs(cell[axis]) >= _LARGEST_CELL or wp.abs(neighbour[axis]) >= _LARGEST_CELL):
             return cell
     return neighbour
-
-
-@wp.kernel
-def _cluster_in_order(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    grid: Radius,
-    offsets: wp.array(dtype=wp.vec3i),
-    min_size: int,
-    # in out: table of voxels, -1 where free, and left so
-    table: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=wp.vec3i),
-    cell_slot: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    # out
-    labels_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-):
-    """One thread: numbers the voxels, joins them, and hands the numbers of their clusters to the points."""
-    mask = table.shape[0] - 1
-    voxels = int(0)
-    c = int(-1)
-    before = wp.vec3i(0, 0, 0)
-    n = labels_out.shape[0]
-    for i in range(n):
-        voxel = int(-1)
-        if i < count_in[0] and is_finite(xyz_in[i]):
-            cell = cell_of(xyz_in[i], grid)
-            # Neighbours in a scan are mostly neighbours in space: often it is the voxel of the point before.
-            if c < 0 or differ(cell, before):
-                before = cell
-                slot = hash_cell(cell) & mask
-                c = table[slot]
-                while c >= 0 and differ(cells[c], cell):
-                    slot = (slot + 1) & mask
-                    c = table[slot]
-                if c < 0:
-                    c = voxels
-                    voxels += 1
-                    table[slot] = c
-                    cells[c] = cell
-                    cell_slot[c] = slot
-                    parent[c] = c
-                    members[c] = 0
-            members[c] = members[c] + 1
-            voxel = c
-        labels_out[i] = voxel
-    for a in range(voxels):
-        cell = cells[a]
-        for o in range(offsets.shape[0]):
-            wanted = _neighbour(cell, offsets[o])
-            slot = hash_cell(wanted) & mask
-            b = table[slot]
-            while b >= 0 and differ(cells[b], wanted):
-                slot = (slot + 1) & mask
-                b = table[slot]
-            if b >= 0:
-                root_a = find(parent, a)
-                root_b = find(parent, b)
-                if root_a != root_b:
-                    parent[wp.max(root_a, root_b)] = wp.min(root_a, root_b)
-    for a in range(voxels):
-        table[cell_slot[a]] = -1
-        root = parent[parent[a]]  # the parent of a lower voxel is its root by now
-        parent[a] = root
-        if root != a:
-            members[root] = members[root] + members[a]
-    clusters = int(0)
-    for a in range(voxels):
-        root = parent[a]
-        if root == a:
-            # Of a root nothing but its label is wanted from here on.
-            label = int(-1)
-            if members[a] >= min_size:
-                label = clusters
-                clusters += 1
-            members[a] = label
-        else:
-            members[a] = members[root]
-    for i in range(n):
-        if labels_out[i] >= 0:
-            labels_out[i] = members[labels_out[i]]
-    cluster_count_out[0] = clusters
 
 
 @wp.kernel
@@ -194,16 +112,20 @@ class GridCluster:
 
         keep("_grid", grid)
         keep("_sequential", sequential)
+        keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
         keep("_offsets", wp.array(offsets, dtype=wp.vec3i, device=device))
         buffers(wp.int32, "labels")
         keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
         if sequential:
-            keep("_table", wp.full(2 << (self.capacity - 1).bit_length(), -1, dtype=wp.int32, device=device))
-            buffers(wp.vec3i, "_cells")
-            buffers(wp.int32, "_cell_slot", "_parent", "_members")
+            by_cell = CellColumns(grid, self.capacity)
+            keep("_by_cell", by_cell)
+            for name in ("_parent", "_members", "_places"):
+                keep(name, wp.empty(self.capacity + by_cell.parts, dtype=wp.int32, device=device))
+            keep("_masks", wp.empty(self.capacity, dtype=wp.uint64, device=device))
+            places = max(LEAST_MAP, MAP_PER_POINT * self.capacity)
+            keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=device))
         else:
             keep("_by_cell", CellTable(grid, self.capacity, device))
-            keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -216,16 +138,7 @@ class GridCluster:
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         if self._sequential:
-            wp.launch(
-                _cluster_in_order,
-                1,
-                inputs=[xyz, count, self._grid, self._offsets, self.min_size],
-                outputs=[
-                    *(self._table, self._cells, self._cell_slot, self._parent, self._members),
-                    *(self.labels[:n], self.cluster_count),
-                ],
-                device=self.device,
-            )
+            self._launch_in_order(xyz, count)
         elif n == 0:
             self.cluster_count.zero_()
         else:
@@ -239,6 +152,25 @@ class GridCluster:
                 device=self.device,
             )
             by_cell.label(n, self.min_size, self.labels, self.cluster_count)
+
+    def _launch_in_order(self, xyz: wp.array, count: wp.array) -> None:
+        by_cell, axes = self._by_cell, _AXES[self.connectivity]
+        by_cell.launch(xyz, count, self._no_include, 0)
+        voxels = [by_cell.ranges, by_cell.columns, by_cell.stacks, axes]
+        by_cell.run(
+            join_own_voxels, [by_cell.layout, *voxels], [self._column_map, self._places, self._masks, self._parent]
+        )
+
+        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+            wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
+
+        if by_cell.parts > 1:
+            run(join_border_voxels, voxels, [self._parent])
+        run(
+            label_points,
+            [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, self.min_size],
+            [self._parent, self._members, self.labels[: xyz.shape[0]], self.cluster_count],
+        )
 
 
 def grid_cluster(points: Any, cell: float, min_size: int = 1, connectivity: int = 26) -> Any:

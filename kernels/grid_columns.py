@@ -1,0 +1,221 @@
+"""Clustering by a grid of voxels on a CPU: columns beside their neighbours. `grid_cluster.py` has the plan."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from .cell_columns import Layout, aligned, is_before, row_of
+from .cell_pairs import find
+from .unchecked import at, put
+
+__all__ = ["join_border_voxels", "join_own_voxels"]
+
+_LARGEST_CELL = wp.constant(1 << 30)
+
+
+@wp.func
+def _reach_of(dx: int, dy: int, axes: int) -> int:
+    """By how much the heights of neighbours in two columns may differ; -1 where there are none."""
+    return wp.min(axes - wp.abs(dx) - wp.abs(dy), 1)
+
+
+@wp.func
+def _are_apart(a: int, b: int) -> bool:
+    """Whether indices differ where float32 has no neighbours any more."""
+    return a != b and (wp.abs(a) >= _LARGEST_CELL or wp.abs(b) >= _LARGEST_CELL)
+
+
+@wp.func
+def _unite(a: int, b: int, parent: wp.array(dtype=wp.int32)):
+    if at(parent, a) != at(parent, b):
+        root_a = find(parent, a)
+        root_b = find(parent, b)
+        if root_a != root_b:
+            put(parent, wp.max(root_a, root_b), wp.min(root_a, root_b))
+
+
+@wp.func
+def _unite_heights(
+    here: wp.vec4i, there: wp.vec4i, reach: int, stacks: wp.array(dtype=wp.vec2i), parent: wp.array(dtype=wp.int32)
+):
+    """Unites the voxels of two columns whose z differ by no more than `reach`, of any height."""
+    if _are_apart(here[0], there[0]) or _are_apart(here[1], there[1]):
+        return
+    low = int(there[2])
+    for a in range(here[2], here[3]):
+        z = at(stacks, a)[0]
+        while low < there[3] and at(stacks, low)[0] < z - reach:
+            low += 1
+        b = int(low)
+        while b < there[3] and at(stacks, b)[0] <= z + reach:
+            if not _are_apart(z, at(stacks, b)[0]):
+                _unite(a, b, parent)
+            b += 1
+
+
+@wp.func
+def _unite_masks(
+    here: wp.vec4i,
+    there: wp.vec4i,
+    here_mask: wp.uint64,
+    there_mask: wp.uint64,
+    reach: int,
+    stacks: wp.array(dtype=wp.vec2i),
+    parent: wp.array(dtype=wp.int32),
+):
+    """The same where both columns have masks. Of voxels on top of each other, which are united, one is enough."""
+    one = wp.uint64(1)
+    apart = at(stacks, here[2])[0] - at(stacks, there[2])[0]
+    by = apart - reach
+    while by <= apart + reach:
+        left = here_mask & aligned(there_mask, by)
+        left = left & ~(left << one)
+        while left != wp.uint64(0):
+            lower = (left & (~left + one)) - one  # ones below the lowest one
+            height = int(wp.bit_count(lower))
+            a = here[2] + int(wp.bit_count(here_mask & lower))
+            b = there[2] + int(wp.bit_count(there_mask & ((one << wp.uint64(height + by)) - one)))
+            left = left & (left - one)
+            _unite(a, b, parent)
+        by += 1
+
+
+@wp.func
+def _unite_rows(
+    columns: wp.array(dtype=wp.vec4i),
+    first: int,
+    last: int,
+    others: int,
+    others_end: int,
+    dx: int,
+    axes: int,
+    stacks: wp.array(dtype=wp.vec2i),
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites the voxels of columns with those of others `dx` rows on."""
+    head = int(others)
+    for k in range(first, last):
+        here = at(columns, k)
+        x = here[0] + dx
+        while head < others_end and is_before(at(columns, head), x, here[1] - 1):
+            head += 1
+        other = int(head)
+        while other < others_end and at(columns, other)[0] == x and at(columns, other)[1] <= here[1] + 1:
+            reach = _reach_of(dx, at(columns, other)[1] - here[1], axes)
+            if other != k and reach >= 0:
+                _unite_heights(here, at(columns, other), reach, stacks, parent)
+            other += 1
+
+
+@wp.kernel
+def join_own_voxels(
+    part: int,
+    parts: int,
+    # in
+    layout_in: wp.array(dtype=Layout),
+    ranges: wp.array(dtype=wp.vec4i),
+    columns: wp.array(dtype=wp.vec4i),
+    stacks: wp.array(dtype=wp.vec2i),
+    axes: int,
+    # in out: a map of columns, -1 where there is none, and left so
+    column_map: wp.array(dtype=wp.int32),
+    # out: the columns' places on the map; their voxels' heights above the lowest as a mask, 0 where it is too short
+    places: wp.array(dtype=wp.int32),
+    masks: wp.array(dtype=wp.uint64),
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites the voxels of a part that are neighbours."""
+    layout = layout_in[0]
+    begin = ranges[part][2]
+    end = ranges[part][3]
+    # A column free on either side, so that no neighbour is in the next row.
+    row_length = layout.depth + 2
+    mapped = layout.high_digits > 0 and layout.width + 1 <= column_map.shape[0] // row_length
+    k = int(begin)
+    while k < end:
+        column = at(columns, k)
+        a = column[2]
+        last = column[3]
+        lowest = at(stacks, a)[0]
+        z = lowest - 2
+        mask = wp.uint64(0)
+        while a < last:
+            below = z
+            z = at(stacks, a)[0]
+            root = int(a)
+            if z == below + 1 and not _are_apart(z, below):
+                root = at(parent, a - 1)
+            put(parent, a, root)
+            mask = mask | (wp.uint64(1) << wp.uint64((z - lowest) & 63))
+            a += 1
+        if z - lowest > 63 or lowest <= 1 - _LARGEST_CELL or z >= _LARGEST_CELL - 1:
+            mask = wp.uint64(0)
+        put(masks, k, mask)
+        if mapped:
+            place = row_of(column[0], layout, 1) * row_length + column[1] - layout.least[1] + 1
+            put(places, k, place)
+            put(column_map, place, k)
+        k += 1
+    k = begin
+    while mapped and k < end:
+        here = at(columns, k)
+        place = at(places, k)
+        here_mask = at(masks, k)
+        o = int(0)
+        while o < 4:
+            dx = wp.min(o, 1)
+            dy = int(1)
+            if o == 1:
+                dy = 0
+            elif o == 2:
+                dy = -1
+            other = at(column_map, place + dx * row_length + dy)
+            reach = _reach_of(dx, dy, axes)
+            if reach >= 0 and other >= begin and other < end:
+                there = at(columns, other)
+                there_mask = at(masks, other)
+                far = wp.max(wp.abs(there[0]), wp.abs(there[1])) >= _LARGEST_CELL - 1
+                if far or here_mask == wp.uint64(0) or there_mask == wp.uint64(0):
+                    _unite_heights(here, there, reach, stacks, parent)
+                else:
+                    _unite_masks(here, there, here_mask, there_mask, reach, stacks, parent)
+            o += 1
+        k += 1
+    k = begin
+    while mapped and k < end:
+        put(column_map, at(places, k), -1)
+        k += 1
+    if not mapped:
+        dx = int(0)
+        while dx < 2:
+            _unite_rows(columns, begin, end, begin, end, dx, axes, stacks, parent)
+            dx += 1
+
+
+@wp.kernel
+def join_border_voxels(
+    # in
+    ranges: wp.array(dtype=wp.vec4i),
+    columns: wp.array(dtype=wp.vec4i),
+    stacks: wp.array(dtype=wp.vec2i),
+    axes: int,
+    # in out
+    parent: wp.array(dtype=wp.int32),
+):
+    """Unites voxels of different parts that are neighbours."""
+    parts = ranges.shape[0]
+    for p in range(parts):
+        for q in range(p + 1, parts):
+            begin = ranges[q][2]
+            end = ranges[q][3]
+            if begin < end:
+                x = columns[begin][0] - 1
+                y = columns[begin][1] - 1
+                last = ranges[p][3]
+                first = int(last)
+                while first > ranges[p][2] and not is_before(columns[first - 1], x, y):
+                    first -= 1
+                dx = int(0)
+                while dx < 2:
+                    _unite_rows(columns, first, last, begin, end, dx, axes, stacks, parent)
+                    dx += 1
