@@ -118,7 +118,7 @@ class DataProcessComponent(Component):
         self.trigger_inputs: tuple[str, ...] = ()
         self._backlog: Backlog | None = None
         self._source = TriggerSource()
-        self._inline = False
+        self._inline = self._runs_later = False
         self._thread: threading.Thread | None = None
         self._serving = threading.Lock()
         self._running: Trigger | None = None
@@ -162,18 +162,23 @@ class DataProcessComponent(Component):
             )
         self._backlog = Backlog(self.name, backlog, self.losses)
         inputs = {name: self.inputs[name] for name in config.inputs}
+        # Inline it runs when the commit is through: no other one to the topic waits for it.
+        self._runs_later = self._inline and backlog.policy != "block" and bool(inputs)
+        after = self._advance if self._runs_later else None
         if config.any:
-            self._source = AnyTrigger(inputs, self._offer)
+            self._source = AnyTrigger(inputs, self._offer, after)
         elif config.all:
             tolerance = round(config.tolerance_ms * 1e6)
-            self._source = AllTrigger(inputs, self._offer, tolerance_ns=tolerance, place=self.name, losses=self.losses)
+            self._source = AllTrigger(
+                inputs, self._offer, after, tolerance_ns=tolerance, place=self.name, losses=self.losses
+            )
 
     def _offer(self, trigger: Trigger) -> None:
         assert self._backlog is not None
         dropped = self._backlog.offer(trigger)
         if dropped is not None:
             self.settle(dropped.version, dropped.epoch)
-        if dropped is not trigger:
+        if dropped is not trigger and not self._runs_later:
             self._advance()
 
     def _advance(self) -> None:
@@ -316,11 +321,15 @@ class DagComponent(DataProcessComponent):
     def start(self) -> None:
         """Starts the workers. After a stop, initialises the processors once more first."""
         assert self._engine is not None, "set_graph comes first"
-        if self._closed:
-            for vertex in self._vertices:
-                vertex.processor.init(vertex.config)
-            self._closed = False
         self._engine.start()
+        try:
+            if self._closed:
+                for vertex in self._vertices:
+                    vertex.processor.init(vertex.config)
+        except BaseException:
+            self._engine.stop()
+            raise
+        self._closed = False
         super().start()
 
     def _start_serving(self) -> None:

@@ -34,12 +34,13 @@ class AnyTrigger(TriggerSource):
     A version is settled when every input has settled it, or has gone past it without having it.
     """
 
-    def __init__(self, inputs: Mapping[str, Input], offer: Offer) -> None:
+    def __init__(self, inputs: Mapping[str, Input], offer: Offer, after: Callable[[], None] | None = None) -> None:
         """Subscribes to the inputs, which must be bound.
 
         Args:
             inputs: Those that trigger, by name.
             offer: Takes the triggers, in the thread that commits or settles.
+            after: Is called in that thread when the commit or settle is through.
         """
         self._windows = {name: one.window for name, one in inputs.items()}
         self._offer = offer
@@ -47,7 +48,7 @@ class AnyTrigger(TriggerSource):
         self._seen: dict[_Order, None] = {}
         self._empty: dict[_Order, set[str]] = {}
         for name, window in self._windows.items():
-            window.subscribe(partial(self._on_commit, name, window.clock), partial(self._on_settle, name))
+            window.subscribe(partial(self._on_commit, name, window.clock), partial(self._on_settle, name), after)
 
     def _on_commit(self, name: str, clock: Clock, entry: Entry) -> None:
         version, epoch = entry.version, entry.epoch
@@ -100,13 +101,21 @@ class AllTrigger(TriggerSource):
     """
 
     def __init__(
-        self, inputs: Mapping[str, Input], offer: Offer, *, tolerance_ns: int, place: str, losses: LossCounters
+        self,
+        inputs: Mapping[str, Input],
+        offer: Offer,
+        after: Callable[[], None] | None = None,
+        *,
+        tolerance_ns: int,
+        place: str,
+        losses: LossCounters,
     ) -> None:
         """Subscribes to the inputs, which must be bound.
 
         Args:
             inputs: By name; the versions of the first are those of the triggers.
             offer: Takes the triggers, in the thread that completes them.
+            after: Is called in that thread when the commit or settle is through.
             tolerance_ns: How far from it the others may be [ns].
             place: The component's name, for the counters.
             losses: Where what stays incomplete is counted.
@@ -122,7 +131,7 @@ class AllTrigger(TriggerSource):
         self._seen: dict[_Order, None] = {}
         self._bound = min(_REMEMBERED, *(window.capacity for window in self._windows.values()))
         for name, window in self._windows.items():
-            window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name))
+            window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after)
 
     def _on_commit(self, name: str, entry: Entry) -> None:
         if name == self._first:

@@ -79,6 +79,7 @@ class Window(Generic[T]):
         self._commit_lock = threading.RLock()
         self._on_commit: tuple[OnCommit, ...] = ()
         self._on_settle: tuple[OnSettle, ...] = ()
+        self._after: tuple[Callable[[], None], ...] = ()
         self._waits: list[Waiting[T]] = []
         self._held: list[_Held] = []
         self._modified: set[tuple[int, int]] = set()
@@ -98,12 +99,16 @@ class Window(Generic[T]):
         """
         return Snapshot(self._state.of_epoch(epoch), stream)
 
-    def subscribe(self, on_commit: OnCommit, on_settle: OnSettle) -> Callable[[], None]:
+    def subscribe(
+        self, on_commit: OnCommit, on_settle: OnSettle, after: Callable[[], None] | None = None
+    ) -> Callable[[], None]:
         """Calls back after each commit that was kept, and after each settle, in the thread that made it.
 
         Args:
-            on_commit: Takes the entry; `triggers` in it is false for one put into the history.
+            on_commit: Takes the entry; `triggers` in it is false for one put into the history. All subscribers are told
+                of a commit before the next one to this window, so it must be short.
             on_settle: Takes the version and its epoch.
+            after: Is called when that is through, and others can commit: it may take its time, which is the producer's.
 
         Returns:
             Ends the subscription.
@@ -111,11 +116,14 @@ class Window(Generic[T]):
         with self._lock:
             self._on_commit = (*self._on_commit, on_commit)
             self._on_settle = (*self._on_settle, on_settle)
+            if after is not None:
+                self._after = (*self._after, after)
 
         def unsubscribe() -> None:
             with self._lock:
                 self._on_commit = tuple(one for one in self._on_commit if one is not on_commit)
                 self._on_settle = tuple(one for one in self._on_settle if one is not on_settle)
+                self._after = tuple(one for one in self._after if one is not after)
 
         return unsubscribe
 
@@ -144,8 +152,12 @@ class Window(Generic[T]):
         """
         with self._commit_lock:
             if isinstance(policy, Reorder):
-                return self._hold(policy, entry, equal, triggers)
-            return self._publish(policy, entry, equal, triggers)
+                status = self._hold(policy, entry, equal, triggers)
+            else:
+                status = self._publish(policy, entry, equal, triggers)
+        for after in self._after:
+            after()
+        return status
 
     def _publish(
         self, policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool | None = None
@@ -260,6 +272,8 @@ class Window(Generic[T]):
                 _log.exception("a subscriber of %s failed at the settled version %d", self.topic, version)
         if self._waits:
             self._end_waits()
+        for after in self._after:
+            after()
 
     def new_epoch(self, epoch: int | None = None) -> int:
         """Starts over, empty: versions may begin anew. Gives the epoch.
@@ -349,6 +363,8 @@ class Window(Generic[T]):
         with self._commit_lock:
             now = self.clock.monotonic_ns()
             self._release(max((number for number, held in enumerate(self._held, 1) if held.due_ns <= now), default=0))
+        for after in self._after:
+            after()
 
     def _release(self, count: int) -> None:
         for _ in range(count):
@@ -358,7 +374,11 @@ class Window(Generic[T]):
     def flush(self) -> None:
         """Publishes all that `Reorder` holds back."""
         with self._commit_lock:
+            if not self._held:
+                return
             self._release(len(self._held))
+        for after in self._after:
+            after()
 
     def verify(self, entry: Entry[T]) -> None:
         """Counts a datum, once, whose payload is not what it was at its commit: somebody wrote to it."""

@@ -125,6 +125,57 @@ def test_a_configuration_that_makes_no_sense_is_refused(config):
         BacklogConfig(**config)
 
 
+def test_settled_versions_that_wait_are_bounded_and_the_oldest_are_given_back_to_be_settled():
+    backlog, losses = make()
+    backlog.offer(Trigger(0))
+    given_back = [backlog.offer(Trigger(version, settled=True)) for version in range(1, 1001)]
+    assert [one.version for one in given_back if one is not None] == list(range(1, 1001 - 256))
+    assert drain(backlog) == [0, *range(1001 - 256, 1001)]
+    assert losses.as_dict() == {}
+
+
+def test_a_backlog_that_was_closed_opens_again():
+    backlog, losses = make(policy="fifo", depth=3)
+    fill(backlog, [1])
+    backlog.close()
+    assert fill(backlog, [2]) == [2]
+    backlog.open()
+    assert fill(backlog, [3]) == [None]
+    assert drain(backlog) == [1, 3]
+    assert losses.as_dict() == {"component": {"shutdown": 1}}
+
+
+def test_take_now_does_not_wait():
+    backlog, _ = make()
+    assert backlog.take_now() is None
+    backlog.offer(Trigger(1))
+    assert len(backlog) == 1
+    assert backlog.take_now().version == 1
+    assert not backlog
+
+
+@pytest.mark.parametrize("policy", ["fifo", "block"])
+def test_several_threads_offer_and_take_without_a_loss_or_a_sleep_too_long(policy):
+    backlog, losses = make(policy=policy, depth=400 if policy == "fifo" else 3)
+    taken = [[] for _ in range(3)]
+
+    def take(number):
+        while (trigger := backlog.take()) is not None:
+            taken[number].append(trigger.version)
+
+    consumers = [threading.Thread(target=take, args=(number,)) for number in range(3)]
+    producers = [threading.Thread(target=fill, args=(backlog, range(n, 400, 4))) for n in range(4)]
+    for thread in (*consumers, *producers):
+        thread.start()
+    for thread in producers:
+        thread.join(20)
+    backlog.close()
+    for thread in consumers:
+        thread.join(20)
+    assert sorted(version for versions in taken for version in versions) == list(range(400))
+    assert losses.as_dict() == {}
+
+
 def test_a_closed_backlog_gives_back_what_is_settled_and_counts_no_loss():
     backlog, losses = make()
     backlog.close()

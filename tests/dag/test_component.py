@@ -11,11 +11,14 @@ from warploom.dag import (
     Component,
     DagComponent,
     GenericComponent,
+    In,
     MonotonicDagComponent,
+    Out,
+    Processor,
     Trigger,
     Vertex,
 )
-from warploom.datamesh import CommitPolicy, DataMesh, EqualVersion, Miss, Status
+from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, ManualClock, Miss, Status
 
 WAIT = 20.0
 FIFO, BLOCK = BacklogConfig(policy="fifo", depth=30), BacklogConfig(policy="block")
@@ -37,30 +40,82 @@ def started():
         component.stop()
 
 
-def doubler(mesh, context=None, backlog=FIFO, name="doubler", topics=("number", "double")):
+def doubler(
+    mesh, context=None, backlog=FIFO, name="doubler", topics=("number", "double"), hand_off="thread", trigger="number"
+):
     component = Doubler(name, context)
     component.bind(mesh, {"number": topics[0], "double": topics[1]})
-    component.set_trigger("number", backlog)
+    component.set_trigger(trigger, backlog, hand_off)
     return component
 
 
-def dag(mesh, *acts, kind=DagComponent, backlog=FIFO, topics=("input", "output"), workers=2, in_flight=1, **calls):
+def joining(mesh, trigger):
+    """A graph that joins the two inputs that trigger it."""
+    component = DagComponent("join")
+    component.add_handles(["left", "right"], ["output"])
+    component.bind(mesh, {"left": "left", "right": "right", "output": "output"})
+    join, commit = JoinOptional(), CommitDagProcessor()
+    commit.component_outputs = component.outputs
+    commit.init(CommitDagProcessor.Config(output="output"))
+    vertices = [
+        Vertex("join", join, {"left": "left", "right": "right"}, {"joined": "joined"}),
+        Vertex("commit", commit, {"value": "joined"}, {}),
+    ]
+    component.set_graph(vertices, workers=1, in_flight=1)
+    component.set_trigger(trigger, FIFO)
+    return component
+
+
+class JoinOptional(Processor):
+    left: In[object] = In(optional=True)
+    right: In[object] = In(optional=True)
+    joined: Out[object]
+
+    def process(self, trigger):
+        self.joined.value = tuple(port.value if port.present else None for port in (self.left, self.right))
+        return Status.OK
+
+
+class Tick(Call):
+    """Takes its value, or None where time triggers."""
+
+    value: In[object] = In(optional=True)
+
+    def process(self, trigger):
+        value = self.value.value if self.value.present else None
+        self.result.value = self.context[self.name](trigger, value)
+        return Status.OK
+
+
+def dag(
+    mesh,
+    *acts,
+    kind=DagComponent,
+    backlog=FIFO,
+    topics=("input", "output"),
+    workers=2,
+    in_flight=1,
+    hand_off="thread",
+    trigger="input",
+    reads=("input",),
+    **calls,
+):
     """A chain of vertices `v0`, `v1` … that do `acts`, and one that commits the result of the last."""
     component = kind(calls.pop("name", "dag"))
     component.add_handles(["input"], ["output"])
     component.bind(mesh, {"input": topics[0], "output": topics[1]})
     vertices = []
     for number, act in enumerate(acts):
-        processor = Call()
+        processor = Call() if reads else Tick()
         processor.name, processor.context = f"v{number}", {f"v{number}": act, **calls}
         source = f"v{number - 1}" if number else "input"
         vertices.append(Vertex(processor.name, processor, {"value": source}, {"result": processor.name}))
-    commit = CommitDagProcessor()
+    commit, config = CommitDagProcessor(), CommitDagProcessor.Config(output="output")
     commit.component_outputs = component.outputs
-    commit.init(CommitDagProcessor.Config(output="output"))
-    vertices.append(Vertex("commit", commit, {"value": f"v{len(acts) - 1}"}, {}))
+    commit.init(config)
+    vertices.append(Vertex("commit", commit, {"value": f"v{len(acts) - 1}"}, {}, config=config))
     component.set_graph(vertices, workers=workers, in_flight=in_flight)
-    component.set_trigger("input", backlog)
+    component.set_trigger(trigger, backlog, hand_off)
     return component
 
 
@@ -409,6 +464,268 @@ def test_stop_closes_all_processors_even_when_one_fails(caplog):
     component.stop()
     assert closed == ["v0", "v1"]
     assert "dag.v0 failed to close" in caplog.text
+
+
+@pytest.mark.parametrize("hand_off", ["thread", "inline"])
+@pytest.mark.parametrize("kind", ["data", "dag", "monotonic"])
+def test_a_component_starts_again_after_a_stop(kind, hand_off, topic):
+    """Its processors are initialised and closed each time; commits in between are counted and settled."""
+    mesh, calls = DataMesh(), []
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    if kind == "data":
+        component = doubler(mesh, topics=("input", "output"), hand_off=hand_off)
+    else:
+        kinds = {"dag": DagComponent, "monotonic": MonotonicDagComponent}
+        component = dag(mesh, same, kind=kinds[kind], hand_off=hand_off, in_flight=3, close=calls.append)
+    for cycle in range(5):
+        component.start()
+        for version in range(cycle * 10, cycle * 10 + 5):
+            given.commit(version, version)
+        component.stop()
+        given.commit(cycle * 10 + 5, 0)
+    assert result.orders == [(0, cycle * 10 + number) for cycle in range(5) for number in range(6)]
+    assert sorted(result.settled) == [5, 15, 25, 35, 45]
+    assert mesh.losses.as_dict() == {component.name: {"shutdown": 5}}
+    assert calls == ([] if kind == "data" else ["v0"] * 5)
+
+
+def test_processors_are_initialised_again_before_a_second_start():
+    calls = []
+
+    class Opening(Call):
+        def init(self, config):
+            calls.append(("init", config))
+
+        def close(self):
+            calls.append("close")
+
+    component = DagComponent("dag")
+    component.add_handles(["input"], [])
+    component.bind(DataMesh(), {"input": "input"})
+    processor = Opening()
+    processor.init("config")
+    component.set_graph([Vertex("v", processor, {"value": "input"}, {}, config="config")], workers=1, in_flight=1)
+    component.set_trigger("input", FIFO)
+    for _ in range(2):
+        component.start()
+        component.stop()
+    assert calls == [("init", "config"), "close", ("init", "config"), "close"]
+
+
+@pytest.mark.parametrize("kind", ["data", "dag"])
+def test_inline_the_committing_thread_runs_the_component(kind, topic, started):
+    mesh, threads = DataMesh(), []
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+
+    def act(trigger, value):
+        threads.append(threading.current_thread())
+        return value
+
+    if kind == "data":
+        component = doubler(mesh, topics=("input", "output"), hand_off="inline")
+        process = component.process
+        component.process = lambda trigger: (act(trigger, 0), process(trigger))[1]
+    else:
+        component = dag(mesh, act, act, hand_off="inline", workers=1)
+    started(component)
+    for version in (1, 2, 3):
+        given.commit(version, version)
+        if kind == "data":
+            assert version in result.entries, "it is done when the commit comes back"
+    result.wait_for(1, 2, 3)
+    assert threading.current_thread() in threads
+    if kind == "data":
+        assert set(threads) == {threading.current_thread()}
+    assert result.settled == []
+
+
+def test_inline_two_threads_that_commit_do_not_run_a_component_at_once(topic, started):
+    """What comes while it runs is taken up by the thread that runs it; nothing is lost, nothing runs twice."""
+    mesh, inside, most = DataMesh(window_capacity=500), [], []
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = doubler(
+        mesh, topics=("input", "output"), hand_off="inline", backlog=BacklogConfig(policy="fifo", depth=400)
+    )
+    process = component.process
+
+    def watched(trigger):
+        inside.append(1)
+        most.append(len(inside))
+        process(trigger)
+        inside.pop()
+        return Status.OK
+
+    component.process = watched
+    started(component)
+    counter = iter(range(400))
+    lock = threading.Lock()
+
+    def commit():
+        while True:
+            with lock:
+                version = next(counter, None)
+                if version is None:
+                    return
+                given.window.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, Entry(version, version, 0, 0))
+
+    threads = [threading.Thread(target=commit) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(WAIT)
+    result.wait_for(*range(400))
+    assert set(most) == {1}
+    assert mesh.losses.as_dict() == {}
+
+
+def test_inline_a_chain_runs_through_without_deep_recursion(topic):
+    """A burst behind a slow frame is served in a loop, not each frame within the one before it."""
+    mesh = DataMesh(window_capacity=600)
+    hold = Holding(0)
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = dag(mesh, hold, hand_off="inline", backlog=BacklogConfig(policy="fifo", depth=500), workers=1)
+    component.start()
+    first = threading.Thread(target=given.commit, args=(0,))
+    first.start()
+    hold.wait_until_held(0)
+    for version in range(1, 500):
+        given.commit(version, version)
+    hold.release(0)
+    first.join(WAIT)
+    component.stop()
+    assert result.events == list(range(500))
+    assert mesh.losses.as_dict() == {}
+
+
+def test_any_runs_for_each_input_with_the_data_of_the_one_that_triggered(topic, started):
+    mesh = DataMesh()
+    component = joining(mesh, {"any": ["left", "right"]})
+    left, right, result = (topic(mesh.window(name)) for name in ("left", "right", "output"))
+    started(component)
+    left.commit(10, "l")
+    result.wait_for(10)
+    right.commit(20, "r")
+    result.wait_for(20)
+    left.commit(20, "l")
+    assert result.entries == {10: ("l", None), 20: (None, "r")}
+    assert mesh.losses.as_dict() == {}
+
+
+def test_all_runs_with_the_data_of_all_inputs_and_settles_what_stays_incomplete(topic, started):
+    mesh = DataMesh(window_capacity=8)
+    component = joining(mesh, {"all": ["left", "right"], "tolerance_ms": 2e-6})
+    left, right, result = (topic(mesh.window(name)) for name in ("left", "right", "output"))
+    started(component)
+    for version in (10, 20, 30):
+        left.commit(version, f"l{version}")
+    right.commit(12, "r12")
+    right.commit(29, "r29")
+    result.wait_for(10, 20, 30)
+    assert result.entries == {10: ("l10", "r12"), 30: ("l30", "r29")}
+    assert result.settled == [20]
+    assert mesh.losses.as_dict() == {"join": {"incomplete": 1}}
+
+
+@pytest.mark.parametrize("kind", ["data", "dag"])
+def test_a_component_runs_by_time_on_the_clock(kind, topic):
+    clock = ManualClock(1_000_000_000)
+    mesh, ran = DataMesh(clock=clock), []
+    result = topic(mesh.window("output"))
+    if kind == "data":
+        component = doubler(mesh, topics=("input", "output"), trigger={"period_ms": 100})
+        component.process = lambda trigger: ran.append((trigger.epoch, trigger.version)) or Status.OK
+    else:
+        component = dag(mesh, lambda t, v: ran.append((t.epoch, t.version)), trigger={"period_ms": 100}, reads=())
+    component.start()
+    expected = []
+    for number in range(1, 4):
+        clock.advance(100_000_000)
+        expected.append((0, 1_000_000_000 + number * 100_000_000))
+        assert result.wait_for_orders(expected[-1])
+    clock.step(-2_000_000_000 + 700_000_000)
+    clock.advance(100_000_000)
+    assert result.wait_for_orders((1, 100_000_000))
+    component.stop()
+    assert ran == [*expected, (1, 100_000_000)]
+    clock.advance(1_000_000_000)
+    assert len(ran) == 4
+
+
+@pytest.mark.parametrize(("overrun", "expected"), [("skip", [1, 5]), ("coalesce", [1, 4, 5])])
+def test_a_component_slower_than_its_ticks_skips_or_coalesces_and_never_bursts(overrun, expected, topic):
+    clock = ManualClock()
+    mesh = DataMesh(clock=clock)
+    hold = Holding(100_000_000)
+    result = topic(mesh.window("output"))
+    component = dag(mesh, hold, trigger={"period_ms": 100, "overrun": overrun}, reads=())
+    component.start()
+    clock.advance(100_000_000)
+    hold.wait_until_held(100_000_000)
+    clock.advance(300_000_000)
+    hold.release(100_000_000)
+    result.wait_for(*(number * 100_000_000 for number in range(1, 5)))
+    while component._is_busy():
+        threading.Event().wait(0.001)
+    clock.advance(100_000_000)
+    result.wait_for(500_000_000)
+    component.stop()
+    assert hold.started == [number * 100_000_000 for number in expected]
+    lost = {"overrun": 3} if overrun == "skip" else {"backlog": 2}
+    assert mesh.losses.as_dict() == {"dag": lost}
+
+
+def test_what_hangs_at_the_stop_is_named_counted_and_left_to_itself(topic, caplog, monkeypatch):
+    """The other vertices are closed, what waits is settled, and the component does not start again meanwhile."""
+    monkeypatch.setattr(DagComponent, "stop_timeout_s", 0.05)
+    mesh, closed = DataMesh(), []
+    hold = Holding(1)
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = dag(mesh, same, hold, close=closed.append)
+    component.start()
+    for version in (1, 2):
+        given.commit(version)
+    hold.wait_until_held(1)
+    workers = list(component._engine._threads)
+    component.stop()
+    assert "dag: v1 hangs at version 1 since the stop" in caplog.text
+    assert mesh.losses.as_dict() == {"dag": {"hung": 1, "shutdown": 1}}
+    assert result.settled == [2]
+    assert closed == ["v0"]
+    with pytest.raises(RuntimeError, match=r"dag cannot start again: \{'v1': 1\} still runs"):
+        component.start()
+    hold.release(1)
+    for worker in workers:
+        worker.join(WAIT)
+
+
+def test_a_data_process_that_hangs_at_the_stop_is_left_to_itself(topic, monkeypatch):
+    monkeypatch.setattr(Doubler, "stop_timeout_s", 0.05)
+    mesh, hang, reached = DataMesh(), threading.Event(), threading.Event()
+    given = topic(mesh.window("number"))
+    component = doubler(mesh)
+    component.process = lambda trigger: (reached.set(), hang.wait(WAIT))[1]
+    component.start()
+    given.commit(1, 1)
+    assert reached.wait(WAIT)
+    thread = component._thread
+    component.stop()
+    assert mesh.losses.as_dict() == {"doubler": {"hung": 1}}
+    with pytest.raises(RuntimeError, match="cannot start again: it hangs at version 1"):
+        component.start()
+    hang.set()
+    thread.join(WAIT)
+
+
+def test_a_producer_that_comes_back_at_a_lower_version_is_followed_by_the_whole_chain(topic, started):
+    mesh = DataMesh()
+    ran = []
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    started(dag(mesh, lambda t, v: ran.append((t.epoch, t.version)), kind=MonotonicDagComponent))
+    for version in (10, 20, 5, 6):
+        given.commit(version, policy=CommitPolicy.FORCE_NEW_EPOCH)
+        assert result.wait_for_orders((int(version < 10), version))
+    assert ran == [(0, 10), (0, 20), (1, 5), (1, 6)]
+    assert mesh.losses.as_dict() == {}
 
 
 def test_names_of_the_configuration_do_not_shadow_the_component():
