@@ -11,9 +11,19 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from .results import Pair, Result, read_pairs, read_results
+from .results import Pair, Result, read_figures, read_pairs, read_results
 
-__all__ = ["SLOWER", "Change", "PeerChange", "compare_pairs", "compare_times"]
+__all__ = [
+    "SLOWER",
+    "Change",
+    "FigureChange",
+    "PeerChange",
+    "compare_figures",
+    "compare_pairs",
+    "compare_times",
+]
+
+_UNITS_OF_TIME = ("s", "ms", "µs")
 
 SLOWER = 1.2
 """By what a time, less the machine's share, must have grown to be called slower."""
@@ -61,6 +71,32 @@ class PeerChange:
         return self.pair.ratio or 0.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class FigureChange:
+    """How a figure has changed: of these, less is better."""
+
+    name: str
+    """What it is."""
+    unit: str
+    """Of both."""
+    old: float
+    """In the old run."""
+    new: float
+    """In the new one."""
+    machine: float
+    """By what the times of all peers have changed; 1 where it is no time."""
+
+    @property
+    def own(self) -> float:
+        """New over old, less the machine's share; infinite where it was zero or less."""
+        return self.new / self.old / self.machine if self.old > 0 else float("inf") if self.new > 0 else 1.0
+
+    @property
+    def is_slower(self) -> bool:
+        """Whether a time has grown by more than 20 %."""
+        return self.unit in _UNITS_OF_TIME and self.own > SLOWER
+
+
 def compare_times(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
     """The times of ours that are in both runs, functions and plans.
 
@@ -70,12 +106,7 @@ def compare_times(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
     """
     before = {_key(result): result for result in read_results(old)}
     after = read_results(new)
-    by_input: dict[tuple[str, str], list[float]] = {}
-    for result in after:
-        if not result.who.startswith("warploom") and _key(result) in before:
-            drift = result.seconds / before[_key(result)].seconds
-            by_input.setdefault((result.kernel, result.on), []).append(drift)
-    everywhere = _median_or_1(drift for drifts in by_input.values() for drift in drifts)
+    by_input, everywhere = _drifts(old, new)
     return [
         Change(
             result=result,
@@ -84,6 +115,28 @@ def compare_times(old: dict[str, Any], new: dict[str, Any]) -> list[Change]:
         )
         for result in after
         if result.who.startswith("warploom") and _key(result) in before
+    ]
+
+
+def compare_figures(old: dict[str, Any], new: dict[str, Any]) -> list[FigureChange]:
+    """The figures that are in both runs: of whole frames, of the start, of memory.
+
+    Args:
+        old: The JSON of a run, as `results.read_measured` reads it.
+        new: That of another.
+    """
+    before = {figure["name"]: figure["value"] for figure in read_figures(old)}
+    _, everywhere = _drifts(old, new)
+    return [
+        FigureChange(
+            name=figure["name"],
+            unit=figure["unit"],
+            old=before[figure["name"]],
+            new=figure["value"],
+            machine=everywhere if figure["unit"] in _UNITS_OF_TIME else 1.0,
+        )
+        for figure in read_figures(new)
+        if figure["name"] in before
     ]
 
 
@@ -100,6 +153,16 @@ def compare_pairs(old: dict[str, Any], new: dict[str, Any]) -> list[PeerChange]:
         for pair in read_pairs(read_results(new))
         if pair.ratio is not None and _pair_key(pair) in before
     ]
+
+
+def _drifts(old: dict[str, Any], new: dict[str, Any]) -> tuple[dict[tuple[str, str], list[float]], float]:
+    """New over old of the peers' times: by kernel and input, and the median of all."""
+    before = {_key(result): result.seconds for result in read_results(old)}
+    by_input: dict[tuple[str, str], list[float]] = {}
+    for result in read_results(new):
+        if not result.who.startswith("warploom") and _key(result) in before:
+            by_input.setdefault((result.kernel, result.on), []).append(result.seconds / before[_key(result)])
+    return by_input, _median_or_1(drift for drifts in by_input.values() for drift in drifts)
 
 
 def _key(result: Result) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from .plots import draw_cost, draw_ratios
-from .results import Pair, Result, read_measured, read_pairs, read_results
+from .results import Pair, Result, read_figures, read_measured, read_pairs, read_results
 
 __all__ = ["number", "render", "score_row", "share", "skipped_lines", "write_report"]
 
@@ -178,10 +178,10 @@ def score_row(score: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _figures(measured: dict[str, Any]) -> Iterator[str]:
-    figures = [figure for _, some in _of_all(measured, "figures") for figure in some]
+    figures = read_figures(measured)
     if not figures:
         return
-    yield from ("## The main job", "")
+    yield from ("## The frame and the start", "")
     yield from _table(
         ("what", "measured:", "goal:", "reached", "how"),
         (

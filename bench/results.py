@@ -10,7 +10,7 @@ from typing import Any
 
 from ..errors import ConfigError
 
-__all__ = ["Pair", "Result", "read_measured", "read_pairs", "read_results"]
+__all__ = ["Pair", "Result", "read_figures", "read_measured", "read_pairs", "read_results"]
 
 _OURS, _PLAN, _ONE_THREAD = "warploom", "warploom plan", "warploom, 1 thread"
 
@@ -138,6 +138,12 @@ def read_results(measured: dict[str, Any]) -> list[Result]:
             )
         )
     return results
+
+
+def read_figures(measured: dict[str, Any]) -> list[dict[str, Any]]:
+    """What `contest.record_figure` took down, those first that have a goal."""
+    figures = [figure for entry in measured["benchmarks"] for figure in entry["extra_info"].get("figures", ())]
+    return sorted(figures, key=lambda figure: figure["goal"] is None)
 
 
 def read_pairs(results: Iterable[Result]) -> Iterator[Pair]:

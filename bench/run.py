@@ -19,9 +19,9 @@ from rich.table import Table
 
 from ..errors import ConfigError, SinkError, WarploomError
 from ..kernels.device import resolve_device
-from .compare import SLOWER, compare_pairs, compare_times
+from .compare import SLOWER, compare_figures, compare_pairs, compare_times
 from .report import number, score_row, share, skipped_lines, write_report
-from .results import Pair, read_measured, read_pairs, read_results
+from .results import Pair, read_figures, read_measured, read_pairs, read_results
 
 __all__ = ["BenchmarkError", "run_benchmarks"]
 
@@ -226,14 +226,13 @@ def _print_pairs(console: Console, pairs: list[Pair]) -> None:
 
 
 def _print_others(console: Console, measured: dict[str, Any]) -> None:
-    infos = [entry["extra_info"] for entry in measured["benchmarks"]]
-    scores = [score for info in infos for score in info.get("scores", ())]
+    scores = [score for entry in measured["benchmarks"] for score in entry["extra_info"].get("scores", ())]
     if scores:
         table = _table("how right", "what", "on", "ours:", "peer", "theirs:", "difference:", "goal:", "reached", "how")
         for score in scores:
             table.add_row(*(cell.replace("**", "") for cell in score_row(score)))
         console.print(table)
-    figures = [figure for info in infos for figure in info.get("figures", ())]
+    figures = read_figures(measured)
     if figures:
         table = _table("figures", "what", "measured:", "goal:", "how")
         for figure in figures:
@@ -243,29 +242,20 @@ def _print_others(console: Console, measured: dict[str, Any]) -> None:
 
 
 def _print_changes(console: Console, old: dict[str, Any], new: dict[str, Any]) -> None:
-    changes, beside = compare_times(old, new), compare_pairs(old, new)
-    if not changes:
+    changes, beside, figures = compare_times(old, new), compare_pairs(old, new), compare_figures(old, new)
+    if not changes and not figures:
         console.print("the earlier run has none of these benchmarks", style="yellow")
         return
-    table = _table(
-        "since the earlier run",
-        *("kernel", "on", "who", "old [ms]:", "new [ms]:", "new / old:", "machine:", "ours:", ""),
-    )
-    for change in changes:
-        result = change.result
-        who = result.who if result.device == "cpu" else f"{result.who}, {result.device}"
-        table.add_row(
-            result.kernel,
-            result.on,
-            who,
-            number(1e3 * change.old_seconds),
-            number(1e3 * result.seconds),
-            f"{change.ratio:.2f}",
-            f"{change.machine:.2f}",
-            f"{change.own:.2f}",
-            "[red]slower" if change.is_slower else "",
-        )
-    console.print(table)
+    heads = ("old:", "new:", "new / old:", "machine:", "ours:", "")
+    if changes:
+        table = _table("since the earlier run [ms]", "kernel", "on", "who", *heads)
+        for change in changes:
+            result = change.result
+            who = result.who if result.device == "cpu" else f"{result.who}, {result.device}"
+            numbers = (number(1e3 * change.old_seconds), number(1e3 * result.seconds), f"{change.ratio:.2f}")
+            mark = "[red]slower" if change.is_slower else ""
+            table.add_row(result.kernel, result.on, who, *numbers, f"{change.machine:.2f}", f"{change.own:.2f}", mark)
+        console.print(table)
     if beside:
         table = _table("ratios to the peers", "kernel", "on", "peer", "old:", "new:")
         for change in beside:
@@ -273,9 +263,18 @@ def _print_changes(console: Console, old: dict[str, Any], new: dict[str, Any]) -
             who = peer.who if peer is not None else ""
             table.add_row(ours.kernel, ours.on, who, share(change.old_ratio), share(change.ratio))
         console.print(table)
-    slower = sum(change.is_slower for change in changes)
+    if figures:
+        table = _table("figures since the earlier run", "what", *heads)
+        for change in figures:
+            numbers = (f"{number(change.old)} {change.unit}", f"{number(change.new)} {change.unit}")
+            ratio = f"{change.new / change.old:.2f}" if change.old > 0 else ""
+            mark = "[red]slower" if change.is_slower else ""
+            table.add_row(change.name, *numbers, ratio, f"{change.machine:.2f}", f"{change.own:.2f}", mark)
+        console.print(table)
+    both = (*changes, *figures)
+    slower = sum(change.is_slower for change in both)
     console.print(
-        f"{slower} of {len(changes)} slower by more than {SLOWER - 1:.0%}, the machine's share (by the peers) left out",
+        f"{slower} of {len(both)} slower by more than {SLOWER - 1:.0%}, the machine's share (by the peers) left out",
         style="red" if slower else "green",
         highlight=False,
     )

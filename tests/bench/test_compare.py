@@ -2,7 +2,7 @@
 
 import pytest
 
-from warploom.bench.compare import compare_pairs, compare_times
+from warploom.bench.compare import compare_figures, compare_pairs, compare_times
 
 
 def by_name(changes):
@@ -53,3 +53,17 @@ def test_ratios_to_the_peers_are_paired(run_of, entry):
     (change,) = compare_pairs(old, new)
     assert change.pair.peer.who == "scipy"
     assert (change.old_ratio, change.ratio) == pytest.approx((0.1, 0.05))
+
+
+def test_figures_are_compared_and_only_times_share_the_machines_drift(run_of, entry):
+    def with_figures(frame, memory, growth):
+        figures = [(frame, "ms", "frame"), (memory, "MiB", "memory"), (growth, "MiB", "growth")]
+        figures = [{"name": n, "value": v, "unit": u, "goal": None, "note": ""} for v, u, n in figures]
+        return {"stats": {}, "extra_info": {"figures": figures}}
+
+    old = run_of(entry("warploom", 0.1), entry("scipy", 0.1), with_figures(40.0, 500.0, 0.0))
+    new = run_of(entry("warploom", 0.1), entry("scipy", 0.2), with_figures(100.0, 1000.0, 0.0))
+    frame, memory, growth = compare_figures(old, new)
+    assert (frame.machine, frame.own, frame.is_slower) == pytest.approx((2.0, 1.25, True))
+    assert (memory.machine, memory.own, memory.is_slower) == (1.0, 2.0, False)
+    assert growth.own == 1.0

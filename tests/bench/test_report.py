@@ -121,9 +121,9 @@ def test_machine_versions_figures_stages_and_what_was_skipped_are_named(report_o
     assert "2030-01-02" in text
     assert "commit: 0123456789ab and changes" in text
     assert "numpy 2.4.0" in text
-    peak = row(text, "peak resident", "The main job")
+    peak = row(text, "peak resident", "The frame and the start")
     assert list(peak.values()) == ["peak resident memory", "900 MiB", "≤ 2048 MiB", "yes", "1000 frames"]
-    assert list(row(text, "first frame", "The main job").values())[1:4] == ["4.25 s", "≤ 4 s", "**no**"]
+    assert list(row(text, "first frame", "The frame and the start").values())[1:4] == ["4.25 s", "≤ 4 s", "**no**"]
     assert row(text, "perception.ground", "Stages")["own work, median [ms]"] == "3.21"
     assert list(row(text, "cluster", "First calls").values()) == ["cluster", "2.50", "0.0200", "3.00"]
     assert "no CUDA device here: `bench_bev[warploom cuda:0-KITTI]`" in text
