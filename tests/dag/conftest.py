@@ -51,6 +51,12 @@ class Topic:
     def new_epoch(self):
         self._output.new_epoch()
 
+    def forget(self):
+        """Lets go of what it saw so far."""
+        with self._changed:
+            for seen in (self.entries, self.settled, self.events, self.orders):
+                seen.clear()
+
     def wait_for_orders(self, *orders):
         """Waits until each (epoch, version) was committed or settled."""
         with self._changed:

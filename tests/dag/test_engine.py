@@ -326,6 +326,123 @@ def test_a_worker_that_waits_keeps_no_frame_alive():
         assert gone() is None
 
 
+class WaitsFor(Step):
+    """Waits until the context lets the frame go on."""
+
+    waits = True
+
+    def __init__(self, act, gates):
+        super().__init__(act)
+        self.gates, self.begun = gates, []
+
+    def begin(self, trigger, resume):
+        self.begun.append(trigger.version)
+        if trigger.version not in self.gates:
+            return False
+        self.gates[trigger.version] = resume
+        return True
+
+
+def wait_until(condition):
+    until = time.monotonic() + WAIT
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.001)
+    assert condition()
+
+
+def test_a_vertex_that_waits_gives_its_worker_back_and_keeps_the_order_of_versions():
+    gates = {1: None, 3: None}
+    waits = Vertex("waits", WaitsFor(ones, gates), {"a": "input"}, {"out": "waits"})
+    timings = []
+    with Frames([waits, vertex("beside", ones, "input")], 1, timings.append) as frames:
+        for version in (1, 2, 3):
+            frames.submit(version, input=0)
+        wait_until(lambda: [t.version for t in timings if t.vertex == "beside"] == [1, 2, 3])
+        assert waits.processor.begun == [1], "frame 2 starts behind frame 1"
+        gates[1]()
+        wait_until(lambda: waits.processor.begun == [1, 2, 3])
+        assert sorted(frames.done) == [1, 2]
+        gates[3]()
+        done = frames.wait()
+    assert all(run.data["waits"] == 1 for run in done.values())
+    assert [t.version for t in timings if t.vertex == "waits"] == [1, 2, 3]
+    first = next(t for t in timings if t.vertex == "waits")
+    assert first.wait_ms > 0
+
+
+def test_a_wait_that_raises_costs_its_frame_alone(caplog):
+    class Raises(WaitsFor):
+        def begin(self, trigger, resume):
+            if trigger.version == 1:
+                raise OSError("no such topic")
+            return False
+
+    with Frames([Vertex("raises", Raises(ones, {}), {"a": "input"}, {"out": "raises"})], 1) as frames:
+        frames.submit(1, input=0)
+        frames.submit(2, input=0)
+        done = frames.wait()
+    assert isinstance(done[1].error, OSError)
+    assert done[2].data["raises"] == 1
+
+
+def test_an_engine_starts_again_after_a_stop():
+    graph = [vertex("first", ones, "input"), vertex("second", ones, "first")]
+    frames = Frames(graph, workers=2)
+    for cycle in range(5):
+        with frames:
+            frames.submit(cycle, input=0)
+            frames.wait()
+    assert sorted(frames.done) == [0, 1, 2, 3, 4]
+
+
+def test_a_vertex_that_hangs_is_named_and_keeps_only_what_needs_it():
+    """Its frame does not end and its own later frames wait; what is beside it runs on. A stop gives up on it."""
+    hang, timings = threading.Event(), []
+    graph = [
+        vertex("hangs", lambda t, v: hang.wait(WAIT) and 1, "input"),
+        vertex("after", ones, "hangs"),
+        vertex("beside", ones, "input"),
+    ]
+    frames = Frames(graph, 2, timings.append)
+    frames.engine.start()
+    for version in (1, 2, 3):
+        frames.submit(version, input=0)
+    wait_until(lambda: [t.version for t in timings] == [1, 2, 3])
+    assert {t.vertex for t in timings} == {"beside"}
+    assert frames.engine.running() == {"hangs": 1}
+    workers = list(frames.engine._threads)
+    assert not frames.engine.stop(timeout=0.05)
+    with pytest.raises(RuntimeError, match=r"graph cannot start again: \{'hangs': 1\} still runs"):
+        frames.engine.start()
+    hang.set()
+    for worker in workers:
+        worker.join(WAIT)
+    assert frames.engine.running() == {}
+
+
+def test_a_slow_vertex_makes_its_frames_wait_and_drops_none():
+    graph = [vertex("slow", lambda t, v: time.sleep(0.002) or 1, "input"), vertex("fast", ones, "slow")]
+    timings = []
+    with Frames(graph, 2, timings.append) as frames:
+        for version in range(20):
+            frames.submit(version, input=0)
+        done = frames.wait()
+    assert all(run.data["fast"] == 1 for run in done.values())
+    waits = [t.wait_ms for t in timings if t.vertex == "slow"]
+    assert waits == sorted(waits), "each waits for all before it"
+
+
+def test_whoever_serves_the_graph_runs_it_without_a_worker():
+    threads = []
+    graph = [vertex(name, lambda t, v: threads.append(threading.current_thread()) or 1, "input") for name in ("a", "b")]
+    engine = GraphEngine("graph", graph, 1)
+    done = []
+    engine.submit(Trigger(1), {"input": 0}, done.append, serves=True)
+    engine.serve()
+    assert len(done) == 1
+    assert set(threads) == {threading.current_thread()}
+
+
 def test_a_graph_of_nothing_is_refused():
     with pytest.raises(ValueError, match="the graph of 'graph' has no vertices"):
         GraphEngine("graph", [], 1)

@@ -1,13 +1,19 @@
 """A process: module files built, checked against each other, started and stopped."""
 
+import gc
 import logging
+import sys
 import threading
+import tracemalloc
+from collections import deque
+from pathlib import Path
 
+import numpy as np
 import pytest
 from graph_parts import Plain
 
 from warploom.dag import Process, load_module
-from warploom.datamesh import DataMesh, Status
+from warploom.datamesh import DataMesh, Input, ManualClock, Status
 from warploom.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
@@ -105,6 +111,155 @@ def test_two_hundred_processes_start_and_stop_and_leave_no_thread(write, topic):
         process.stop()
         assert sorted(text.events) == list(range(cycle % 3))
         assert threading.active_count() == before
+
+
+def cycle_many_times(process, cycles, topic):
+    """Starts, feeds and stops a process; gives threads, open files and memory in use after a third and at the end."""
+    number, text = topic(process.mesh.window("sensor/number")), topic(process.mesh.window("result/text"))
+    measured = []
+    for cycle in range(cycles):
+        process.start()
+        number.commit(cycle, cycle)
+        process.stop()
+        text.wait_for(cycle)
+        for topic_seen in (number, text):
+            topic_seen.forget()
+        if cycle in (cycles // 3, cycles - 1):
+            gc.collect()
+            files = len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").is_dir() else 0
+            measured.append((threading.active_count(), files, tracemalloc.get_traced_memory()[0]))
+    assert process.mesh.losses.as_dict() == {}
+    return measured
+
+
+@pytest.fixture
+def traced():
+    tracemalloc.start()
+    yield
+    tracemalloc.stop()
+
+
+def test_three_hundred_starts_and_stops_of_a_process_leave_nothing_behind(write, topic, traced):
+    """The components start and stop again and again; memory may grow by what 200 log records would take."""
+    process = build(write(GOOD), offline=True)
+    (threads, files, memory), after = cycle_many_times(process, 300, topic)
+    assert after[:2] == (threads, files)
+    assert after[2] - memory < 200_000
+    assert len(Plain.events) == 600
+
+
+@pytest.mark.slow
+def test_ten_thousand_starts_and_stops_of_a_process_leave_nothing_behind(write, topic, traced, monkeypatch):
+    monkeypatch.setattr(Plain, "events", deque(maxlen=4))
+    process = build(write(GOOD), offline=True)
+    (threads, files, memory), after = cycle_many_times(process, 10_000, topic)
+    assert after[:2] == (threads, files)
+    assert after[2] - memory < 200_000
+
+
+def test_python_switches_threads_sooner_while_a_process_runs(write):
+    before = sys.getswitchinterval()
+    path = write(GOOD)
+    first, second, third = build(path), build(path, switch_interval_s=50e-6), build(path, switch_interval_s=None)
+    first.start()
+    assert sys.getswitchinterval() == pytest.approx(100e-6)
+    second.start()
+    third.start()
+    assert sys.getswitchinterval() == pytest.approx(50e-6)
+    second.stop()
+    assert sys.getswitchinterval() == pytest.approx(100e-6)
+    first.stop()
+    assert sys.getswitchinterval() == before
+    third.stop()
+    assert sys.getswitchinterval() == before
+
+
+def test_a_process_that_checks_finds_a_processor_that_writes_to_its_input(write, topic, tmp_path, monkeypatch):
+    (tmp_path / "writing_parts.py").write_text(
+        "import numpy as np\n"
+        "from warploom.dag import In, Processor\n"
+        "from warploom.datamesh import Status\n\n\n"
+        "class Writes(Processor):\n"
+        "    value: In[object]\n\n"
+        "    def process(self, trigger):\n"
+        "        self.value.value.base[0] = 5.0\n"
+        "        return Status.OK\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    text = (
+        "module: m\ncomponents:\n  - {name: c, kind: dag, trigger: number, inputs: {number: sensor/number},\n"
+        "     graph: {w: {processor: writing_parts.Writes, in: {value: number}}}}\n"
+    )
+    process = build(write(text), external={"sensor/number": object}, check=True, offline=True)
+    number = topic(process.mesh.window("sensor/number", 1))
+    process.start()
+    number.commit(1, np.zeros(4)[:2])
+    process.stop()
+    number.commit(2, np.zeros(4)[:2])
+    with Input.access(bound_input(process.mesh.window("sensor/number"))):
+        pass
+    for version in range(3, 40):
+        number.commit(version, np.zeros(4)[:2])
+    assert process.mesh.losses["sensor/number", "modified"] == 1
+
+
+def bound_input(window):
+    handle = Input()
+    handle.bind("input", window)
+    return handle
+
+
+@pytest.mark.parametrize(
+    "trigger", ["{any: [number, side]}", "{all: [number, side], tolerance_ms: 5}", "{period_ms: 10}"]
+)
+def test_every_kind_of_trigger_can_be_configured(trigger, write, topic):
+    text = (
+        f"module: m\ncomponents:\n  - name: c\n    kind: data\n    class: graph_parts.Doubler\n    trigger: {trigger}\n"
+        "    hand_off: inline\n    inputs: {number: sensor/number}\n    outputs: {double: result/double}\n"
+    )
+    if "side" in trigger:
+        text = text.replace("graph_parts.Doubler", "graph_parts.TwoInputs")
+        text = text.replace("{number: sensor/number}", "{number: sensor/number, side: sensor/side}")
+    clock = ManualClock(1000)
+    outside = {"sensor/number": int, "sensor/side": int}
+    process = build(write(text), external=outside, mesh=DataMesh(clock=clock), offline=True)
+    number, side, double = (topic(process.mesh.window(n)) for n in ("sensor/number", "sensor/side", "result/double"))
+    process.start()
+    if "period" in trigger:
+        clock.advance(30_000_000)
+        process.stop()
+        assert double.settled == [10_001_000, 20_001_000, 30_001_000]
+        return
+    number.commit(10, 1)
+    side.commit(12, 2)
+    process.stop()
+    assert double.events == ([10, 12] if "any" in trigger else [10])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ("kind: data\n", "kind: data\n    deadline: {ms: 5}\n", 18, "a component of kind data has no deadline"),
+        ("workers: 2", "workers: 2\n    deadline: {ms: 5, on_mis: cut}", 9, "deadline.on_mis: unknown key"),
+        ("trigger: number\n    inputs: {", "trigger: {any: [numbr]}\n    inputs: {", 5,
+         "the trigger must be one of the inputs, not 'numbr'; did you mean 'number'?"),
+        ("trigger: number\n    inputs: {", "trigger: {any: [number], every: 3}\n    inputs: {",
+         5, "trigger.every: unknown"),
+        ("trigger: number\n    inputs: {", "trigger: {any: [number], period_ms: 3}\n    inputs: {", 5,
+         "a trigger is one of any, all and period_ms"),
+        ("trigger: number\n    inputs: {", "trigger: {period_ms: 3}\n    inputs: {", 12,
+         "input 'number' is not among the triggers of time"),
+        ("workers: 2", "workers: 2\n    hand_off: fast", 9, "hand_off: Input should be 'thread' or 'inline'"),
+        ("config: {amount: 1}", "config: {amount: 1}, deadline_ms: 0", 12, "add.deadline_ms: Input should be greater"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_triggers_and_deadlines_are_told_with_their_place(write, old, new, line, said):
+    assert GOOD.count(old) == 1
+    with pytest.raises(ConfigError) as caught:
+        build(write(GOOD.replace(old, new)))
+    told = str(caught.value)
+    assert said in told, told
+    assert f"module.yaml:{line}: " in told, told
 
 
 def test_modules_of_a_process_share_its_topics(write, topic):

@@ -104,6 +104,18 @@ class Doubler(DataProcessComponent):
             return self.double.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
 
 
+class TwoInputs(DataProcessComponent):
+    number: Input[int]
+    side: Input[int]
+    double: Output[int]
+
+    def process(self, trigger):
+        with self.double.allocate_change() as change:
+            change.set_version(trigger.version)
+            change.value = dict(trigger.inputs)
+            return self.double.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+
+
 class Graph(DagComponent):
     pass
 
