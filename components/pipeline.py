@@ -280,7 +280,10 @@ def profile_modules(
         ConfigError: A module is not there, or bad, or a setting is for none of their components.
     """
     settings = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
-    files = [load_module(_find_module(profile, name), {**settings, **changes}) for name in profile.content.modules]
+    sensors = profile.content.sensors
+    files = [
+        load_module(_find_module(profile, name), {**settings, **changes}, sensors) for name in profile.content.modules
+    ]
     known = {component.name for file in files for component in file.content.components}
     for key in profile.content.settings:
         if key.split(".")[0] not in known:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,9 @@ __all__ = ["CONF", "LidarSpec", "ModelsSpec", "Profile", "ThreadsSpec", "load_pr
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 """The configuration that ships with the package."""
+
+
+SensorKind = Literal["lidar", "camera", "radar", "gnss", "imu", "wheel"]
 
 
 class _Spec(BaseModel):
@@ -56,6 +59,8 @@ class Profile(_Spec):
     """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
     threads: ThreadsSpec = ThreadsSpec()
     lidar: LidarSpec = LidarSpec()
+    sensors: dict[SensorKind, list[str]] = {}
+    """Names of the sensors by kind; the placeholders of module files stand for them."""
     models: ModelsSpec = ModelsSpec()
     modules: list[str] = Field(min_length=1)
     """Module files, by name or path."""

@@ -8,7 +8,8 @@ from .deadline import DeadlineConfig
 from .drawing import draw_mermaid, draw_text
 from .engine import GraphEngine, Run, Vertex, VertexTiming
 from .flags import YamlFlags
-from .process import Process, load_module
+from .modules import load_module
+from .process import Process
 from .processor import In, Out, Processor, ProcessorConfig, ProcessorHarness
 from .schema import ComponentSpec, FlagLoaderSpec, ModuleSpec, VertexSpec
 from .svg import draw_svg

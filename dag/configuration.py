@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_origin
 
@@ -13,10 +13,12 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from ..errors import ConfigError
+from .units import field_unit, hint_for_key, hint_for_value
 
 __all__ = ["ConfigFile", "find_config", "import_class", "nearest", "override", "parse_overrides"]
 
 M = TypeVar("M", bound=BaseModel)
+Expand = Callable[[dict[str, Any]], tuple[dict[str, Any], Mapping[tuple[str | int, ...], str | int]]]
 
 _ENVIRONMENT_PREFIX = "WARPLOOM__"
 
@@ -50,7 +52,12 @@ class ConfigFile(Generic[M]):
     """One configuration file: its model, and for messages the lines on which its keys stand."""
 
     def __init__(
-        self, path: str | Path, model: type[M], changes: Mapping[tuple[str | int, ...], Any] | None = None
+        self,
+        path: str | Path,
+        model: type[M],
+        changes: Mapping[tuple[str | int, ...], Any] | None = None,
+        *,
+        expand: Expand | None = None,
     ) -> None:
         """Reads and validates a file.
 
@@ -58,6 +65,8 @@ class ConfigFile(Generic[M]):
             path: The YAML file.
             model: What it must fit.
             changes: Values that replace those of the file, by the path of their keys.
+            expand: What is done to the file's values first: gives the values, and for each that stands elsewhere now
+                its path → its key in the file. A ValueError of it is told as one of the file.
 
         Raises:
             ConfigError: It cannot be read, is not YAML, or does not fit the model; the message names the file, the
@@ -81,6 +90,12 @@ class ConfigFile(Generic[M]):
         _unique_keys(self._root, self.path, set())
         if not isinstance(data, dict):
             raise ConfigError(f"{self.path}:1: expected a mapping of keys to values, found {type(data).__name__}")
+        self._origins: Mapping[tuple[str | int, ...], str | int] = {}
+        if expand is not None:
+            try:
+                data, self._origins = expand(data)
+            except ValueError as error:
+                raise self._told(str(error)) from error
         self._changes = tuple(changes or {})
         for keys, value in (changes or {}).items():
             override(data, keys, value)
@@ -92,7 +107,8 @@ class ConfigFile(Generic[M]):
     def line(self, keys: Sequence[str | int]) -> int:
         """The line, from 1, on which a key stands; that of its nearest parent where it is not in the file."""
         node, line = self._root, 1
-        for key in keys:
+        for depth, key in enumerate(keys):
+            key = self._origins.get(tuple(keys[: depth + 1]), key)
             if isinstance(node, yaml.MappingNode):
                 pair = next(((k, v) for k, v in node.value if k.value == str(key)), None)
                 if pair is None:
@@ -104,6 +120,11 @@ class ConfigFile(Generic[M]):
             else:
                 return line
         return line
+
+    def _told(self, message: str) -> ConfigError:
+        """An error whose message begins with the keys that it is about."""
+        keys, _, what = message.partition(": ")
+        return self.error([int(key) if key.isdecimal() else key for key in keys.split(".")], what)
 
     def error(self, keys: Sequence[str | int], message: str) -> ConfigError:
         """An error about a key of this file."""
@@ -128,26 +149,33 @@ class ConfigFile(Generic[M]):
             if any(tuple(keys[: len(change)]) == change for change in self._changes):
                 where += " (as set from outside the file)"
             if problem["type"] == "extra_forbidden":
-                known = _known_keys(model, problem["loc"][:-1])
-                lines.append(f"{where}: unknown key; {nearest(str(keys[-1]), known)}")
+                owner = _model_at(model, problem["loc"][:-1])
+                known = list(_fields(owner))
+                hint = hint_for_key(str(keys[-1]), problem["input"], known, owner)
+                lines.append(f"{where}: unknown key; " + (f"{hint}; " if hint else "") + nearest(str(keys[-1]), known))
             elif problem["type"] == "missing":
                 lines.append(f"{where}: this key is missing")
             else:
                 expected = problem["msg"].removeprefix("Value error, ")
                 found = problem["input"]
+                unit = field_unit(_model_at(model, problem["loc"][:-1]), str(keys[-1])) if keys else None
+                hint = hint_for_value(found, unit)
+                if unit is not None and isinstance(found, (int, float)):
+                    expected += f" [{unit}]"
                 found = type(found).__name__ if isinstance(found, (dict, list)) else repr(found)
-                lines.append(f"{where}: {expected}" + (f", found {found}" if problem["type"] != "value_error" else ""))
+                told = f", found {found}" if problem["type"] != "value_error" else ""
+                lines.append(f"{where}: {expected}{told}" + (f"; {hint}" if hint else ""))
         return lines
 
 
-def _known_keys(model: Any, keys: Sequence[str | int]) -> list[str]:
-    """The keys that a model takes at a place within it."""
+def _model_at(model: Any, keys: Sequence[str | int]) -> Any:
+    """What a model takes at a place within it."""
     for key in keys:
         if get_origin(model) in (list, dict):
             model = get_args(model)[-1]
         else:
             model = _fields(model).get(str(key), model)
-    return list(_fields(model))
+    return model
 
 
 def _fields(annotation: Any) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import logging
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 from ..datamesh import DataMesh
@@ -19,52 +18,11 @@ from .flags import load_flags
 from .graph import DeclaredVertex, check_payloads, declare_vertices, graph_payloads, type_name
 from .schema import ComponentSpec, ModuleSpec
 
-__all__ = ["Process", "load_module", "module_changes"]
+__all__ = ["Process"]
 
 _log = logging.getLogger(__name__)
 
 _Place = tuple[ConfigFile[ModuleSpec], int]
-
-
-def load_module(path: Path, changes: Mapping[tuple[str, ...], Any] | None = None) -> ConfigFile[ModuleSpec]:
-    """Reads and validates a module file.
-
-    Args:
-        path: The file.
-        changes: Settings by (component, …, key); those for components that are not in the file are left out.
-
-    Raises:
-        ConfigError: The file is bad.
-    """
-    file = ConfigFile(path, ModuleSpec)
-    placed = module_changes(file.content, changes or {})
-    return ConfigFile(path, ModuleSpec, placed) if placed else file
-
-
-def module_changes(module: ModuleSpec, changes: Mapping[tuple[str, ...], Any]) -> dict[tuple[str | int, ...], Any]:
-    """Settings by the user's keys, made into keys of the file.
-
-    `component.vertex.key` is a key of the vertex's configuration, `component.key` one of the component's configuration
-    or, where the component's schema has it (`workers`, `in_flight`, `backlog` …), of the component.
-    """
-    placed: dict[tuple[str | int, ...], Any] = {}
-    for keys, value in changes.items():
-        for index, component in enumerate(module.components):
-            if len(keys) < 2 or component.name != keys[0]:
-                continue
-            if keys[1] in component.graph and len(keys) > 2:
-                place: tuple[str, ...] = ("graph", keys[1], "config", *keys[2:])
-            elif keys[1] in {field.alias or name for name, field in ComponentSpec.model_fields.items()}:
-                place = keys[1:]
-            elif component.graph:
-                raise ConfigError(
-                    f"setting {'.'.join(keys)}: component {component.name!r} has no vertex {keys[1]!r}; "
-                    f"{nearest(keys[1], component.graph)}"
-                )
-            else:
-                place = ("config", *keys[1:])
-            placed["components", index, *place] = value
-    return placed
 
 
 class Process:
