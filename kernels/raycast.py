@@ -1,9 +1,9 @@
 """LiDAR ray casting: beams against instanced triangle meshes, and what a sensor makes of the echoes.
 
 Two levels of bounding volumes: one over the instances of a scene, rebuilt whenever they move, and one a mesh, built
-once. A ray is carried into the frame of each instance it may
-hit, so a thousand parked cars cost as little memory as one.
-Every face has a label: its material in the low byte, its class above.
+once. A ray is carried into the frame of each instance it may hit, so a thousand parked cars cost as little memory as
+one. Every face has a label: its material in the low byte, its class above. A GPU casts each ray on its own, a CPU near
+ones together, eight at once.
 
 All that looks like chance (glass that lets a beam through, noise, lost echoes) is a hash of seed and beam, so the
 same scene gives the same bytes again.
@@ -17,80 +17,45 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .beams import MATERIALS, NO_HIT, first_hit, ray_of, turn_at, uniform
 from .device import DEFAULT_DEVICE
 from .interop import borrow, family_of, give
 from .meshes import MeshSet
-from .threads import run_together, thread_count
+from .ray_packets import cast_packets, hit_packets
+from .threads import launch_parts, run_together, thread_count
 
 __all__ = ["MATERIALS", "LidarCast", "RayHits", "raycast"]
 
-MATERIALS = 256
-"""Rows of a table of materials; the low byte of a face's label names its row."""
-
-_HASH_0, _HASH_1, _HASH_2, _HASH_3 = (
-    wp.constant(wp.uint32(prime)) for prime in (2654435761, 2246822519, 2246822507, 3266489909)
-)
 _MATERIAL_MASK = wp.constant(MATERIALS - 1)
 _CLASS_SHIFT = wp.constant(8)
 _REFLECTIVITY, _POROSITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in range(5))
-# A beam passes at most this many porous faces of one instance: panes, leaves, meshes of a fence.
-_MAX_PASSES = wp.constant(6)
-_STEP = wp.constant(1.0e-3)  # [m] beyond a porous face, where the beam goes on
-_NO_HIT = wp.constant(-1)
 _NOWHERE = 1.0e9  # [m]
-# On a CPU beams are cast in parts, one a thread, that take turns by so many beams: near ones meet the same faces.
-_BLOCK = wp.constant(256)
+_BLOCK = wp.constant(256)  # beams of a part's turn
 
 
-@wp.func
-def _place_of(thread: int, part: int, parts: int) -> int:
-    """The beam of a thread of a part."""
-    return ((thread // _BLOCK) * parts + part) * _BLOCK + thread % _BLOCK
-
-
-def _launch_in_parts(kernel: wp.Kernel, n: int, device: str, inputs: list, outputs: list) -> None:
-    """One beam a thread on a GPU, one part of them on each of a CPU's threads; none shares anything with another."""
-    parts = min(thread_count(), -(-n // int(_BLOCK))) if device == DEFAULT_DEVICE else 1
-    if parts < 2 or wp.get_device(device).is_capturing:
+def _launch_in_parts(kernel: wp.Kernel, parts: int, n: int, device: str, inputs: list, outputs: list) -> None:
+    """One beam a thread on a GPU; on a CPU parts, which take turns by blocks of beams."""
+    if parts == 1 or wp.get_device(device).is_capturing:
         wp.launch(kernel, n, inputs=[0, 1, *inputs], outputs=outputs, device=device)
         return
     dim = -(-n // (int(_BLOCK) * parts)) * int(_BLOCK)
-    calls = [
-        wp.launch(kernel, dim, inputs=[part, parts, *inputs], outputs=outputs, device=device, record_cmd=True).launch
+    launches = [
+        wp.launch(kernel, dim, inputs=[part, parts, *inputs], outputs=outputs, device=device, record_cmd=True)
         for part in range(parts)
     ]
-    run_together(calls)
-
-
-@wp.func
-def _uniform(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
-    """A number in [0, 1) from a hash of three integers (the finaliser of MurmurHash3)."""
-    h = seed ^ (a * _HASH_0) ^ (b * _HASH_1)
-    h = (h ^ (h >> wp.uint32(16))) * _HASH_2
-    h = (h ^ (h >> wp.uint32(13))) * _HASH_3
-    h = h ^ (h >> wp.uint32(16))
-    return float(h >> wp.uint32(8)) * (1.0 / 16777216.0)
+    run_together([launch.launch for launch in launches])
 
 
 @wp.func
 def _gauss(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
     """A nearly normal number, within ± 3.5: the sum of four uniform ones, which needs no logarithm and no cosine."""
-    u = _uniform(seed, a, b) + _uniform(seed + wp.uint32(1), a, b)
-    v = _uniform(seed + wp.uint32(2), a, b) + _uniform(seed + wp.uint32(3), a, b)
+    u = uniform(seed, a, b) + uniform(seed + wp.uint32(1), a, b)
+    v = uniform(seed + wp.uint32(2), a, b) + uniform(seed + wp.uint32(3), a, b)
     return (u + v - 2.0) * 1.7320508
-
-
-@wp.func
-def _turn(pose_in: wp.array(dtype=wp.transform), fraction: float) -> wp.quat:
-    """The sensor's attitude within a sweep: between two near quaternions a chord does for the arc."""
-    start = wp.transform_get_rotation(pose_in[0])
-    return wp.normalize(start + fraction * (wp.transform_get_rotation(pose_in[1]) - start))
 
 
 @wp.kernel
 def _cast(
-    part: int,
-    parts: int,
     # in: beams
     beams_in: wp.array(dtype=wp.vec3),
     fraction_in: wp.array(dtype=wp.float32),
@@ -112,67 +77,17 @@ def _cast(
     normal_out: wp.array(dtype=wp.vec3),
 ):
     """Finds the first face that each beam does not pass through."""
-    i = _place_of(wp.tid(), part, parts)
-    if i >= beams_in.shape[0]:
-        return
-    f = fraction_in[i]
-    start = wp.transform_get_translation(pose_in[0])
-    end = wp.transform_get_translation(pose_in[1])
-    turn = _turn(pose_in, f)
-    origin = start + f * (end - start)
-    direction = wp.normalize(wp.quat_rotate(turn, beams_in[i]))
-    seed = seed_in[0]
-
-    best = max_range
-    best_instance = int(_NO_HIT)
-    best_face = int(_NO_HIT)
-    best_label = int(_NO_HIT)
-    best_normal = wp.vec3(0.0, 0.0, 0.0)
-    found = int(0)
-    item = int(0)  # the first instance comes first: its hit bounds the search among the others
-    more = bool(True)
-    query = wp.bvh_query_ray(scene_in[0], origin, direction)
-    while more:
-        r0 = rows_in[item, 0]
-        r1 = rows_in[item, 1]
-        r2 = rows_in[item, 2]
-        a0 = wp.vec3(r0[0], r0[1], r0[2])
-        a1 = wp.vec3(r1[0], r1[1], r1[2])
-        a2 = wp.vec3(r2[0], r2[1], r2[2])
-        local = wp.vec3(wp.dot(a0, origin) + r0[3], wp.dot(a1, origin) + r1[3], wp.dot(a2, origin) + r2[3])
-        along = wp.vec3(wp.dot(a0, direction), wp.dot(a1, direction), wp.dot(a2, direction))
-        base = first_face_in[item]
-        gone = float(0.0)
-        passes = int(0)
-        while passes < _MAX_PASSES:
-            passes += 1
-            hit = wp.mesh_query_ray(mesh_in[item], local + gone * along, along, best - gone)
-            if not hit.result:
-                break
-            t = gone + hit.t
-            label = label_in[base + hit.face]
-            porosity = material_in[label & _MATERIAL_MASK, _POROSITY]
-            through = porosity > 0.0 and _uniform(seed + wp.uint32(item), wp.uint32(i), wp.uint32(hit.face)) < porosity
-            if through and passes < _MAX_PASSES:
-                gone = t + _STEP
-                if gone >= best:
-                    break
-            else:
-                if t < best or (t == best and item < best_instance):
-                    best = t
-                    best_instance = item
-                    best_face = hit.face
-                    best_label = label
-                    n = hit.normal
-                    best_normal = wp.normalize(n[0] * a0 + n[1] * a1 + n[2] * a2)
-                break
-        more = wp.bvh_query_next(query, found, best)
-        item = found + 1
-    distance_out[i] = wp.where(best_instance >= 0, best, 0.0)
-    instance_out[i] = best_instance
-    face_out[i] = best_face
-    hit_label_out[i] = best_label
-    normal_out[i] = best_normal
+    i = wp.tid()
+    origin, direction = ray_of(i, beams_in, fraction_in, pose_in)
+    distance, instance, face, label, normal = first_hit(
+        i, origin, direction, max_range, seed_in[0], scene_in[0], mesh_in, first_face_in, rows_in, label_in,
+        material_in,
+    )  # fmt: skip
+    distance_out[i] = distance
+    instance_out[i] = instance
+    face_out[i] = face
+    hit_label_out[i] = label
+    normal_out[i] = normal
 
 
 @wp.kernel
@@ -199,14 +114,14 @@ def _sense(
     intensity_out: wp.array(dtype=wp.float32),
 ):
     """Makes an echo of each hit: its noisy range and its intensity, or none where it is too weak."""
-    i = _place_of(wp.tid(), part, parts)
+    i = (wp.tid() // _BLOCK * parts + part) * _BLOCK + wp.tid() % _BLOCK
     if i >= beams_in.shape[0]:
         return
     kept_out[i] = 0
     d = distance_in[i]
     if d < min_range or hit_label_in[i] < 0:
         return
-    turn = _turn(pose_in, fraction_in[i])
+    turn = turn_at(pose_in, fraction_in[i])
     cosine = wp.abs(wp.dot(wp.quat_rotate(turn, beams_in[i]), normal_in[i]))
     material = hit_label_in[i] & _MATERIAL_MASK
     seed = seed_in[0] ^ wp.uint32(0x5BD1E995)
@@ -225,7 +140,7 @@ def _sense(
     signal = echo / (d * d) * (reach * reach) * 10.0
     cube = signal * signal * signal
     seen = cube / (1.0 + cube)
-    chance = _uniform(seed, k, wp.uint32(3))
+    chance = uniform(seed, k, wp.uint32(3))
     if chance > seen * (1.0 - drop_out) * (1.0 - material_in[material, _LOSS]):
         return
     kept_out[i] = 1
@@ -301,6 +216,9 @@ class LidarCast:
     """Standard deviation of a range [m]."""
     drop_out: float = 0.01
     """Share of the echoes that are lost for no reason."""
+    method: str = "auto"
+    """`packets` (eight rays at once, for a CPU), `single` (one a thread), or `auto`: `packets` on a CPU, else
+    `single`."""
 
     def __post_init__(self):
         device, n = self.meshes.device, len(self.beams)
@@ -309,8 +227,13 @@ class LidarCast:
                 f"beams, ring and time must have one length > 0, not {n}, {len(self.ring)}, {len(self.time)}"
             )
 
-        def hold(name: str, array: wp.array) -> None:
-            object.__setattr__(self, name, array)
+        if self.method not in ("auto", "packets", "single"):
+            raise ValueError(f"method must be 'auto', 'packets' or 'single', not {self.method!r}")
+        if self.method == "packets" and device != DEFAULT_DEVICE:
+            raise ValueError(f"method 'packets' is for the CPU, not for {device}")
+
+        def hold(name: str, value: Any) -> None:
+            object.__setattr__(self, name, value)
 
         def upload(values: Any, dtype: type, numpy_type: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values, numpy_type), dtype=dtype, device=device)
@@ -336,6 +259,13 @@ class LidarCast:
         ):  # fmt: skip
             hold(name, wp.zeros(n, dtype=dtype, device=device))
         hold("count", wp.zeros(1, dtype=wp.int32, device=device))
+        hold("_parts", 1)
+        hold("_packets", device == DEFAULT_DEVICE and self.method != "single")
+        if self._packets:
+            hold("_parts", min(thread_count(), -(-n // int(_BLOCK))))
+            hold("_order", upload(_order_of(self.beams), wp.int32, np.int32))
+            hold("_ray_origin", wp.zeros(n, dtype=wp.vec3, device=device))
+            hold("_ray_direction", wp.zeros(n, dtype=wp.vec3, device=device))
 
     def set_materials(self, table: np.ndarray) -> None:
         """Sets the table of materials, shape (256, 5).
@@ -399,18 +329,17 @@ class LidarCast:
     def launch(self) -> None:
         """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`."""
         device, n = self.meshes.device, self._beams.shape[0]
-        _launch_in_parts(
-            _cast,
-            n,
-            device,
-            [
-                self._beams, self._fraction, self._pose, self.max_range, self._seed, self._scene_id, self._mesh,
-                self._first_face, self._rows, self.meshes.labels, self._material,
-            ],
-            [self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],
-        )  # fmt: skip
+        beams = [self._beams, self._fraction, self._pose, self.max_range, self._seed]
+        scene = [self._scene_id, self._mesh, self._first_face, self._rows, self.meshes.labels, self._material]
+        hits = [self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal]
+        if self._packets:
+            rays = [self._ray_origin, self._ray_direction]
+            launch_parts(cast_packets, self._parts, [self._order, *beams, *scene], [*rays, *hits])
+        else:
+            wp.launch(_cast, n, inputs=[*beams, *scene], outputs=hits, device=device)
         _launch_in_parts(
             _sense,
+            self._parts,
             n,
             device,
             [
@@ -434,10 +363,19 @@ class LidarCast:
         )  # fmt: skip
 
 
+def _order_of(beams: Any) -> np.ndarray:
+    """Beams in an order in which near ones follow each other: along a curve of Morton over azimuth and elevation."""
+    x, y, z = np.asarray(beams, np.float64).T
+    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    cells = np.stack([azimuth + np.pi, elevation + 0.5 * np.pi]) / (2.0 * np.pi) * 65535.0
+    key = cells.astype(np.uint32)
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        key = (key | (key << np.uint32(shift))) & np.uint32(mask)
+    return np.argsort(key[0] | (key[1] << np.uint32(1)), kind="stable")
+
+
 @wp.kernel
 def _first_hit(
-    part: int,
-    parts: int,
     # in
     mesh: wp.uint64,
     origins_in: wp.array(dtype=wp.vec3),
@@ -448,9 +386,7 @@ def _first_hit(
     face_out: wp.array(dtype=wp.int32),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    i = _place_of(wp.tid(), part, parts)
-    if i >= origins_in.shape[0]:
-        return
+    i = wp.tid()
     direction = wp.normalize(directions_in[i])
     hit = wp.mesh_query_ray(mesh, origins_in[i], direction, max_distance)
     if hit.result:
@@ -459,7 +395,7 @@ def _first_hit(
         normal_out[i] = hit.normal
     else:
         distance_out[i] = wp.inf
-        face_out[i] = _NO_HIT
+        face_out[i] = NO_HIT
         normal_out[i] = wp.vec3(0.0, 0.0, 0.0)
 
 
@@ -505,11 +441,16 @@ def raycast(vertices: Any, faces: Any, origins: Any, directions: Any, *, max_dis
     distance = wp.empty(n, dtype=wp.float32, device=device)
     face = wp.empty(n, dtype=wp.int32, device=device)
     normal = wp.empty(n, dtype=wp.vec3, device=device)
-    mesh = wp.Mesh(points=points.view(wp.vec3).flatten(), indices=corners.flatten())
+    # The tree serves one call only: the quickest to build is the best.
+    quick = {"bvh_constructor": "cubql", "bvh_leaf_size": 4} if str(device) == DEFAULT_DEVICE else {}
+    mesh = wp.Mesh(points=points.view(wp.vec3).flatten(), indices=corners.flatten(), **quick)
     if n:
-        along = along.view(wp.vec3).flatten()
-        given = [mesh.id, starts.view(wp.vec3).flatten(), along, float(max_distance)]
-        _launch_in_parts(_first_hit, n, str(device), given, [distance, face, normal])
+        inputs = [mesh.id, starts.view(wp.vec3).flatten(), along.view(wp.vec3).flatten(), float(max_distance)]
+        outputs = [distance, face, normal]
+        if str(device) == DEFAULT_DEVICE:
+            launch_parts(hit_packets, min(thread_count(), -(-n // int(_BLOCK))), inputs, outputs)
+        else:
+            wp.launch(_first_hit, n, inputs=inputs, outputs=outputs, device=device)
     hits = RayHits(give(distance, family), give(face, family), give(normal, family))
     del keep_points, keep_corners, keep_starts, keep_along
     return hits

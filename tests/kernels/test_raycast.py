@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warploom.kernels.meshes import MeshSet
-from warploom.kernels.raycast import MATERIALS, LidarCast, raycast
+from warploom.kernels.raycast import MATERIALS, LidarCast, _first_hit, raycast
 from warploom.kernels.threads import set_thread_count, thread_count
 
 # float32 coordinates of up to about 60 m: a few units in the last place of a distance.
@@ -61,6 +61,65 @@ def test_hits_are_those_of_a_brute_force_search():
     assert agrees(hits.distance, expected)
     assert (hits.face == which).mean() >= 0.999
     assert np.isfinite(expected).mean() > 0.2
+
+
+def fan(n, spread=0.02, seed=0):
+    """Rays of one origin, each near the one before, as those of a sensor."""
+    random = np.random.default_rng(seed)
+    azimuth = np.linspace(0, spread * n, n) + random.uniform(0, 6)
+    elevation = 0.4 * np.sin(azimuth * 3)
+    directions = np.stack([np.cos(azimuth), np.sin(azimuth), elevation], axis=1).astype(np.float32)
+    return np.zeros((n, 3), np.float32), directions
+
+
+@pytest.mark.parametrize("n", [1, 7, 8, 9, 3000])
+@pytest.mark.parametrize("spread", [1e-5, 0.002, 0.1])
+def test_near_rays_go_together_and_hit_what_each_alone_would(n, spread):
+    """To the byte what Warp's own query says of each ray, and what a brute force search says within rounding."""
+    vertices, faces, _, _ = soup(10, faces=400)
+    origins, directions = fan(n, spread)
+    hits = raycast(vertices, faces, origins, directions)
+    mesh = wp.Mesh(points=wp.array(vertices, dtype=wp.vec3), indices=wp.array(faces.ravel(), dtype=wp.int32))
+    alone = [wp.empty(n, dtype=dtype) for dtype in (wp.float32, wp.int32, wp.vec3)]
+    rays = [wp.array(array, dtype=wp.vec3) for array in (origins, directions)]
+    wp.launch(_first_hit, n, inputs=[mesh.id, *rays, 1e6], outputs=alone)
+    for got, expected in zip((hits.distance, hits.face, hits.normal), alone, strict=True):
+        assert np.array_equal(got, expected.numpy())
+    assert agrees(hits.distance, brute_force(vertices, faces, origins, directions)[0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([1e-3, 1.0, 1e5]), st.integers(1, 40))
+def test_sizes_and_odd_faces_do_no_harm(seed, size, faces):
+    """Duplicates, points, lines and faces that are not finite: what is left is hit as if they were not there."""
+    random = np.random.default_rng(seed)
+    vertices, corners, _, _ = soup(seed, faces=faces)
+    origins, directions = fan(64, 0.05, seed)
+    vertices = (vertices * size).astype(np.float32)
+    odd = np.concatenate([corners[:3], corners[:3, [0, 0, 1]], corners[:3, [2, 2, 2]]])
+    broken = random.normal(0, size, (6, 3)).astype(np.float32)
+    broken[[0, 4], [1, 2]] = np.nan, np.inf
+    all_vertices = np.concatenate([vertices, broken])
+    all_corners = np.concatenate([corners, odd, len(vertices) + np.arange(6, dtype=np.int32).reshape(2, 3)])
+    plain = raycast(vertices, corners, origins, directions)
+    got = raycast(vertices, np.concatenate([corners, odd]), origins, directions)
+    assert np.array_equal(plain.distance, got.distance)
+    with_broken = raycast(all_vertices, all_corners, origins, directions)
+    assert not np.isnan(with_broken.distance).any()
+    assert (with_broken.face < len(all_corners)).all()
+
+
+def test_rays_that_are_not_finite_or_go_nowhere_hit_nothing():
+    vertices, faces, _, _ = soup(11)
+    origins, directions = fan(64)
+    bad = [3, 17, 18, 40]
+    directions[3], directions[17], origins[18], directions[40] = np.nan, np.inf, np.nan, 0.0
+    hits = raycast(vertices, faces, origins, directions)
+    assert (hits.face[bad] == -1).all()
+    assert np.isinf(hits.distance[bad]).all()
+    good = np.setdiff1d(np.arange(64), bad)
+    clean = raycast(vertices, faces, origins[good], directions[good])
+    assert np.array_equal(hits.distance[good], clean.distance)
 
 
 def test_hits_are_those_of_open3d():
@@ -214,6 +273,49 @@ def test_porous_faces_let_their_share_of_beams_through():
     assert 0.4 < share < 0.6
 
 
+@pytest.mark.parametrize("moving", [False, True])
+def test_packets_and_single_rays_agree(moving):
+    """Instances turned and scaled, some of them porous: equal but for rays that meet an edge, one in a thousand."""
+    random = np.random.default_rng(12)
+    meshes = MeshSet("cpu", max_faces=1000)
+    for seed, label in ((1, PLAIN), (2, HALF), (3, GHOST)):
+        vertices, faces, _, _ = soup(seed, faces=60)
+        meshes.add(vertices * 0.5, faces, np.full(len(faces), label + 256 * seed))
+    which, transforms = random.integers(0, 3, 40), affine(random, 40)
+    end = np.eye(4)
+    end[:3, 3] = 0.8, 0.1, 0.0
+    results = []
+    for method in ("packets", "single"):
+        cast = caster(meshes, beams(5000), range_noise=0.02, drop_out=0.1, method=method)
+        cast.place(which, transforms)
+        cast.aim(np.eye(4), end if moving else None, seed=4)
+        cast.launch()
+        results.append([getattr(cast, name).numpy() for name in ("distance", "hit_instance", "hit_label")])
+    for packets, single in zip(*results, strict=True):
+        assert (packets == single).mean() > 0.999
+    assert (results[0][1] >= 0).mean() > 0.2
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_a_sweep_does_not_depend_on_the_number_of_threads(threads):
+    before = thread_count()
+    meshes = MeshSet("cpu", max_faces=1000)
+    vertices, faces, _, _ = soup(8)
+    meshes.add(vertices, faces, np.full(len(faces), HALF))
+    sweeps = []
+    try:
+        for count in (1, threads):
+            set_thread_count(count)
+            cast = caster(meshes, beams(2000), range_noise=0.02, drop_out=0.1)
+            cast.place(np.zeros(1, int), np.eye(4)[None])
+            cast.aim(np.eye(4), seed=1)
+            cast.launch()
+            sweeps.append(cast.points.numpy()[: cast.count.numpy()[0]].tobytes())
+    finally:
+        set_thread_count(before)
+    assert sweeps[0] == sweeps[1]
+
+
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
     meshes = MeshSet("cpu", max_faces=1000)
     vertices, faces, _, _ = soup(8)
@@ -294,6 +396,8 @@ def test_wrong_meshes_and_scenes_are_refused():
         cast.place(np.zeros(3, int), np.tile(np.eye(4), (3, 1, 1)))
     with pytest.raises(ValueError, match="table"):
         cast.set_materials(np.zeros((3, 4)))
+    with pytest.raises(ValueError, match="method must be 'auto', 'packets' or 'single', not 'both'"):
+        caster(meshes, beams(10), method="both")
 
 
 @pytest.mark.cuda
