@@ -60,9 +60,7 @@ def bench_chain(benchmark, contest, scan, captured, device):
     how = "captured" if captured else "direct"
     benchmark.extra_info.update(kernel="kernel chain", on=f"{scan}, {how}", size=len(points), device=device)
     benchmark(launch)
-    # The goal is that of the way that is taken unless the caller says otherwise.
-    default = captured == (device != "cpu" or thread_count() == 1)
-    goal = GOALS[device] if default and scan in WHOLE else None
+    goal = GOALS[device] if captured and scan in WHOLE else None
     record(benchmark, f"kernel chain, {how}, {scan}, {device}", points, device, goal)
 
 

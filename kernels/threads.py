@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import copy
+from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
@@ -17,7 +20,10 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 
-__all__ = ["launch_parts", "run_together", "set_thread_count", "thread_count"]
+__all__ = ["CREW", "forks_taken_by", "launch_parts", "run_together", "set_thread_count", "thread_count"]
+
+CREW = "warploom-kernels-"
+"""What the names of the threads begin with."""
 
 _MOST = 8  # more gain little: memory is the limit by then
 
@@ -75,7 +81,7 @@ class _Crew:
         if self._threads < len(jobs):
             with self._growing:
                 for number in range(self._threads, len(jobs)):
-                    threading.Thread(target=self._work, name=f"warploom-kernels-{number}", daemon=True).start()
+                    threading.Thread(target=self._work, name=f"{CREW}{number}", daemon=True).start()
                     self._threads = number + 1
         for job in jobs:
             self._jobs.put(job)
@@ -118,12 +124,30 @@ def set_thread_count(count: int) -> None:
     _thread_count = int(count)
 
 
+_take_fork: Callable[[Sequence[Callable[[], Any]]], None] | None = None
+
+
+@contextmanager
+def forks_taken_by(take: Callable[[Sequence[Callable[[], Any]]], None]) -> Iterator[None]:
+    """While the CPU's launches are captured, gives the calls that would run at once to `take`, which calls them."""
+    global _take_fork
+    before, _take_fork = _take_fork, take
+    try:
+        yield
+    finally:
+        _take_fork = before
+
+
 def run_together(calls: Sequence[Callable[[], Any]]) -> None:
     """Runs calls at once, the first on this thread, and returns when all have ended.
 
     While the CPU's launches are being captured, they run one after the other on this thread.
     """
-    if len(calls) < 2 or wp.get_device(DEFAULT_DEVICE).is_capturing:
+    is_capturing = wp.get_device(DEFAULT_DEVICE).is_capturing
+    if is_capturing and _take_fork is not None and len(calls) > 1:
+        _take_fork(calls)
+        return
+    if len(calls) < 2 or is_capturing:
         for call in calls:
             call()
         return
@@ -149,15 +173,23 @@ def launch_parts(kernel: Any, parts: int, inputs: Sequence[Any], outputs: Sequen
         inputs: The parameters that follow.
         outputs: Those that it writes.
     """
-    if parts == 1 or wp.get_device(DEFAULT_DEVICE).is_capturing:
-        for part in range(parts):
-            wp.launch(kernel, 1, inputs=[part, parts, *inputs], outputs=list(outputs), device=DEFAULT_DEVICE)
+
+    def launch(part: int, **how: Any) -> Any:
+        given = [part, parts, *inputs]
+        return wp.launch(kernel, 1, inputs=given, outputs=list(outputs), device=DEFAULT_DEVICE, **how)
+
+    if parts == 1:
+        launch(0)
         return
-    # Recorded here, where a module that is not loaded yet is loaded once.
-    commands = [
-        wp.launch(
-            kernel, 1, inputs=[part, parts, *inputs], outputs=list(outputs), device=DEFAULT_DEVICE, record_cmd=True
-        )
-        for part in range(parts)
-    ]
+    if wp.get_device(DEFAULT_DEVICE).is_capturing:
+        run_together([partial(launch, part) for part in range(parts)])
+        return
+    # Recorded here, where a module that is not loaded yet is loaded once; the others differ by the part alone, and to
+    # pack all parameters again would take longer than to launch them.
+    commands = [launch(0, record_cmd=True)]
+    for part in range(1, parts):
+        command = copy(commands[0])
+        command.params = list(command.params)
+        command.set_param_at_index(0, part)
+        commands.append(command)
     run_together([command.launch for command in commands])
