@@ -291,7 +291,8 @@ class DagComponent(DataProcessComponent):
         self._closed = False
         self._submitting = threading.Lock()
         self._free = 1
-        self._idle = threading.Condition()
+        self._slots = threading.Lock()
+        self._idle = threading.Condition(self._slots)
         self.in_flight = 1
 
     def add_handles(self, inputs: Sequence[str], outputs: Sequence[str]) -> None:
@@ -393,7 +394,7 @@ class DagComponent(DataProcessComponent):
         if data is None:
             self.settle(trigger.version, trigger.epoch)
             return
-        with self._idle:
+        with self._slots:
             self._free -= 1
         deadline = None
         if self._deadline is not None:
@@ -403,14 +404,15 @@ class DagComponent(DataProcessComponent):
     def _data(self, trigger: Trigger) -> dict[str, Any] | None:
         """The data that triggered, by input; None, counted, where they are gone."""
         data: dict[str, Any] = {}
+        stream = getattr(self.context, "stream", None)
         for name, version in trigger.inputs.items():
-            with self.inputs[name].access(trigger.epoch, getattr(self.context, "stream", None)) as snapshot:
-                index = snapshot.version_index(version)
-                if index < 0:
-                    miss = snapshot.miss(version)
-                    self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
-                    return None
-                data[name] = snapshot[index]
+            snapshot = self.inputs[name].window.snapshot(trigger.epoch, stream)
+            index = snapshot.version_index(version)
+            if index < 0:
+                miss = snapshot.miss(version)
+                self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
+                return None
+            data[name] = snapshot[index]
         return data
 
     def _done(self, run: Run) -> None:

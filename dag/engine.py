@@ -82,10 +82,12 @@ class Run:
     trigger: Trigger
     data: dict[str, Any]
     on_done: Callable[[Run], None]
-    waiting: dict[Vertex, int] = field(default_factory=dict)
+    waiting: dict[Vertex, int]
     """Predecessors that have yet to finish, by vertex."""
-    ready_ns: dict[Vertex, int] = field(default_factory=dict)
-    remaining: int = 0
+    ready_ns: dict[Vertex, int]
+    """When the inputs of each vertex were there."""
+    remaining: int
+    """Vertices that have yet to finish."""
     error: BaseException | None = None
     failed_vertex: str = ""
     deadline: FrameDeadline | None = None
@@ -131,6 +133,8 @@ class GraphEngine:
             vertex.predecessors = len(sources)
             for source in sources.values():
                 source.successors.append(vertex)
+        self._predecessors = {vertex: vertex.predecessors for vertex in vertices}
+        self._roots = [vertex for vertex in vertices if vertex.predecessors == 0]
 
     def start(self) -> None:
         """Starts the workers.
@@ -197,16 +201,14 @@ class GraphEngine:
             serves: The caller serves the graph next, so one worker fewer is woken.
         """
         vertices = self._vertices
-        run = Run(trigger, data, on_done, remaining=len(vertices), deadline=deadline)
-        now = time.perf_counter_ns()
+        ready_ns = dict.fromkeys(self._roots, time.perf_counter_ns())
+        run = Run(trigger, data, on_done, self._predecessors.copy(), ready_ns, len(vertices), deadline=deadline)
         ready = 0
         with self._lock:
             for vertex in vertices:
-                run.waiting[vertex] = vertex.predecessors
                 vertex.queue.append(run)
-                if vertex.predecessors == 0:
-                    run.ready_ns[vertex] = now
-                    ready += self._offer(vertex)
+            for vertex in self._roots:
+                ready += self._offer(vertex)
             wakes = self._claim(ready - serves)
         for _ in range(wakes):
             self._wakes.put(None)
