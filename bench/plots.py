@@ -12,7 +12,7 @@ from .results import Pair, Result
 __all__ = ["draw_cost", "draw_ratios"]
 
 _FONT = "font-family='system-ui,sans-serif'"
-_OURS = "#0b62c4"
+_OURS, _TAICHI = "#0b62c4", "#4aa8ff"
 _PEERS = ("#c2410c", "#15803d", "#9333ea", "#a16207", "#0e7490", "#db2777", "#4d7c0f", "#6b7280", "#7f1d1d", "#111827")
 _INK, _FAINT = "#222", "#ccc"
 _STREET = re.compile(r"street (10k|120k|500k|2M)")
@@ -112,7 +112,9 @@ def _shows_growth(curves: dict[str, list[tuple[int, float]]]) -> bool:
 
 
 def _colour(who: str, names: Sequence[str]) -> str:
-    return _OURS if who.startswith("warploom") else _PEERS[names.index(who) % len(_PEERS)]
+    if who.startswith("warploom"):
+        return _TAICHI if "Taichi" in who else _OURS
+    return _PEERS[names.index(who) % len(_PEERS)]
 
 
 def _panel(
