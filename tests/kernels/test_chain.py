@@ -1,5 +1,6 @@
 """The chain against its steps, called one by one through their own functions: equal to the bit, frame after frame."""
 
+import re
 import threading
 
 import numpy as np
@@ -293,6 +294,20 @@ def test_device_arrays_may_be_written_and_read_without_the_host(device):
     assert np.array_equal(chain.labels.numpy()[:kept], expected["labels"])
     assert int(chain.cluster_count.numpy()[0]) == len(expected["boxes"])
     assert np.array_equal(chain.result().index, expected["index"])
+
+
+def test_the_examples_of_the_docs_run(repository, tmp_path, monkeypatch, frames, capsys):
+    """On the CPU; the lines that need a kernel of the reader's are left out."""
+    blocks = re.findall(r"```python\n(.*?)```", (repository / "docs" / "kernels.md").read_text(encoding="utf-8"), re.S)
+    (tmp_path / "scans").mkdir()
+    for name in ("000000.bin", "scans/000000.bin", "scans/000001.bin"):
+        frames[0].astype(np.float32).tofile(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    code = "".join(blocks).replace('device="cuda:0"', "captured=True").replace("my_kernel(", "print(")
+    names: dict = {}
+    exec(compile(code, "kernels.md", "exec"), names)
+    assert np.array_equal(names["found"].labels, wl.KernelChain(config=wl.ChainConfig(radius=0.6))(frames[0]).labels)
+    assert capsys.readouterr().out
 
 
 @pytest.mark.cuda
