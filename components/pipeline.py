@@ -280,10 +280,13 @@ def profile_modules(
         ConfigError: A module is not there, or bad, or a setting is for none of their components.
     """
     settings = {tuple(key.split(".")): value for key, value in profile.content.settings.items()}
-    sensors = profile.content.sensors
-    files = [
-        load_module(_find_module(profile, name), {**settings, **changes}, sensors) for name in profile.content.modules
-    ]
+    files = []
+    for index, name in enumerate(profile.content.modules):
+        try:
+            path = _find_module(profile, name)
+        except ConfigError as error:
+            raise profile.error(["modules", index], str(error)) from None
+        files.append(load_module(path, {**settings, **changes}, profile.content.sensors))
     known = {component.name for file in files for component in file.content.components}
     for key in profile.content.settings:
         if key.split(".")[0] not in known:

@@ -65,7 +65,7 @@ def flow_of(modules: Sequence[ModuleSpec]) -> Flow:
         if not component.graph:
             nodes[box] = Node(box, component.name, "component", component.class_name)
             for name, topic in component.inputs.items():
-                arrows.append(Arrow(_topic(topic), box, weak=not _triggers(component, name)))
+                arrows.append(Arrow(_topic(topic), box, weak=name not in component.trigger.inputs))
             arrows += [Arrow(box, _topic(topic)) for topic in component.outputs.values()]
             continue
         groups[box] = f"{component.name} ({component.kind})", [_node(box, name) for name in component.graph]
@@ -84,7 +84,9 @@ def flow_of(modules: Sequence[ModuleSpec]) -> Flow:
             config = component.graph[name].config
             for other in _named(config, "input", "inputs"):
                 if other in component.inputs:
-                    arrows.append(Arrow(_topic(component.inputs[other]), node, weak=not _triggers(component, other)))
+                    arrows.append(
+                        Arrow(_topic(component.inputs[other]), node, weak=other not in component.trigger.inputs)
+                    )
             for output in _named(config, "output", "outputs"):
                 if output in component.outputs:
                     arrows.append(Arrow(node, _topic(component.outputs[output])))
@@ -98,12 +100,6 @@ def _named(config: dict, *keys: str) -> list[str]:
         value = config.get(key)
         found += [value] if isinstance(value, str) else [one for one in value or () if isinstance(one, str)]
     return found
-
-
-def _triggers(component: ComponentSpec, name: str) -> bool:
-    """Whether an input is one that starts a run."""
-    trigger = component.model_dump(mode="json").get("trigger")
-    return name in (trigger if isinstance(trigger, (list, dict)) else (trigger,)) or name in str(trigger).split()
 
 
 def _vertex_edges(component: ComponentSpec) -> list[tuple[str, list[str], list[str]]]:
