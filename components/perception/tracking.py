@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...dag import In, Out, Processor, ProcessorConfig, Trigger
+from ...dag import In, Out, Processor, Trigger
 from ...datamesh import Status
 from ...models.tracker import Tracker
 from ..messages import DetectedObjects, Obstacles
+from .tracker_settings import TrackerSettings
 
 __all__ = ["TrackingProcessor"]
 
@@ -15,12 +16,14 @@ __all__ = ["TrackingProcessor"]
 class TrackingProcessor(Processor):
     """Keeps the tracks. Belongs in a monotonic component: it takes the frames one by one, in the order of versions."""
 
+    Config = TrackerSettings
+
     detected: In[DetectedObjects]
     obstacles: Out[Obstacles]
 
-    def init(self, config: ProcessorConfig) -> None:
+    def init(self, config: TrackerSettings) -> None:
         """Starts without tracks."""
-        self._tracker = Tracker()
+        self._tracker = Tracker(config.tracker_config())
         self._epoch: int | None = None
 
     def process(self, trigger: Trigger) -> Status:

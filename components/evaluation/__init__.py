@@ -1,0 +1,1 @@
+"""`warploom eval`: what the package finds, measured on data sets."""

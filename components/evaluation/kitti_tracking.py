@@ -1,0 +1,235 @@
+"""KITTI's tracking set as tables for tracker and evaluation: labels, detections, poses; and tracks as result files.
+
+Labels, detections and results are in the rectified frame of camera 0. Here its axes are renamed to x forward, y left,
+z up, which keeps every overlap what KITTI's own evaluation has.
+"""
+
+from __future__ import annotations
+
+import pathlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import SourceError
+from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
+from ...models.evaluation.tracking import TrackTable
+from ...models.geometry import KittiCalibration, box_corners, invert, kitti_poses
+
+__all__ = ["TYPES", "ObjectType", "TrackingSequence", "detected_type", "sequence_names", "write_results"]
+
+_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # renamed from the camera's
+_IMAGE = (1242.0, 375.0)  # pixels
+_LEAST_HEIGHT = 25.0  # pixels: what is lower in the image counts neither way
+_MOST_OCCLUSION, _MOST_TRUNCATION = 2, 0
+_DETECTION_COLUMNS = 15
+_CAMERA = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectType:
+    """One of the types that KITTI evaluates."""
+
+    name: str
+    """As the label files have it."""
+    number: int
+    """As files of detections have it."""
+    neighbours: tuple[str, ...]
+    """Types of labels that are neither right nor wrong to find."""
+    class_index: int
+    """The class in `models.classes`."""
+
+
+TYPES = (
+    ObjectType(name="Pedestrian", number=1, neighbours=("Person_sitting",), class_index=PEDESTRIAN),
+    ObjectType(name="Car", number=2, neighbours=("Van",), class_index=VEHICLE),
+    ObjectType(name="Cyclist", number=3, neighbours=(), class_index=CYCLIST),
+)
+"""The types that KITTI evaluates."""
+
+
+def _numbers(path: pathlib.Path, delimiter: str | None = None) -> np.ndarray:
+    try:
+        text = path.read_text()
+        return np.array([[float(v) for v in line.split(delimiter)] for line in text.splitlines() if line.strip()])
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; expected rows of as many numbers each") from error
+
+
+def sequence_names(data: pathlib.Path, detections: pathlib.Path) -> list[str]:
+    """The sequences that have both labels and detections, in order.
+
+    Raises:
+        SourceError: There are none.
+    """
+    names = [path.stem for path in sorted(detections.glob("*.txt")) if (data / "label_02" / path.name).exists()]
+    if not names:
+        raise SourceError(
+            f"{detections}: no sequence that {data / 'label_02'} has labels of; expected files such as 0001.txt"
+        )
+    return names
+
+
+def detected_type(detections: pathlib.Path, names: list[str]) -> ObjectType:
+    """The one type of object that the detections are of.
+
+    Raises:
+        SourceError: They are of none that KITTI evaluates, or of several.
+    """
+    numbers: set[int] = set()
+    for name in names:
+        rows = _numbers(detections / f"{name}.txt", ",")
+        if rows.size:
+            numbers |= set(rows[:, 1].astype(int).tolist())
+    found = [kind for kind in TYPES if kind.number in numbers]
+    if len(numbers) != 1 or not found:
+        known = ", ".join(f"{kind.number} {kind.name}" for kind in TYPES)
+        raise SourceError(f"{detections}: types {sorted(numbers)} in the second column; expected one of {known}")
+    return found[0]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrackingSequence:
+    """One sequence of the set with the detections of one type."""
+
+    name: str
+    frames: np.ndarray
+    """Numbers of all frames, in order, shape (f,), int64."""
+    truth: TrackTable
+    """Objects of the type, those to be ignored among them."""
+    boxes: list[np.ndarray]
+    """Detections of each frame, x y z l w h yaw, renamed axes, shapes (n, 7)."""
+    scores: list[np.ndarray]
+    """Their scores in [0, 1], shapes (n,)."""
+    logits: bool
+    """Whether the file has logits, as any score outside [0, 1] shows."""
+    poses: np.ndarray | None
+    """World from the renamed frame for each of `frames`, shape (f, 4, 4); None without GPS/IMU records."""
+    dont_care: dict[int, np.ndarray]
+    """By frame the areas of the image without labels: left, top, right, bottom [pixels], shape (k, 4)."""
+    projection: np.ndarray
+    """Pixels of the left colour camera from the rectified frame, shape (3, 4)."""
+
+    @classmethod
+    def read(
+        cls, data: pathlib.Path, detections: pathlib.Path, name: str, kind: ObjectType, *, logits: bool | None = None
+    ) -> TrackingSequence:
+        """Reads a sequence.
+
+        Objects are ignored, as KITTI and AB3DMOT do it, that are of a neighbouring type (Van for Car, Person_sitting
+        for Pedestrian), occluded to the third degree, or cut off by the image's edge.
+
+        Args:
+            data: Folder with `label_02/`, `calib/` and, for the ego poses, `oxts/`.
+            detections: Folder with `NAME.txt`: frame, type, image box (4), score, h w l x y z ry, alpha.
+            name: Of the sequence, such as `0001`.
+            kind: The type to read.
+            logits: Whether scores are logits; None looks into this file alone.
+
+        Raises:
+            SourceError: A file is missing or damaged.
+        """
+        calibration = KittiCalibration.read(data / "calib" / f"{name}.txt")
+        labels, dont_care = _read_labels(data / "label_02" / f"{name}.txt", kind)
+        found = _numbers(detections / f"{name}.txt", ",").reshape(-1, _DETECTION_COLUMNS)
+        found = found[found[:, 1] == kind.number]
+        oxts = data / "oxts" / f"{name}.txt"
+        poses, first = None, 0
+        count = int(max(labels[:, 0].max(initial=-1), found[:, 0].max(initial=-1))) + 1
+        if oxts.exists():
+            records = _numbers(oxts)
+            # A part of a sequence has its records alone, the last of which is of the last frame.
+            first = max(count - len(records), 0)
+            count = first + len(records)
+            poses = kitti_poses(records, calibration.lidar_from_imu)
+            poses = poses @ invert(calibration.rectified_from_lidar) @ _AXES.T
+        frames = np.arange(first, count)
+        if logits is None:
+            logits = bool(((found[:, 6] < 0.0) | (found[:, 6] > 1.0)).any())
+        scores = 1.0 / (1.0 + np.exp(-found[:, 6])) if logits else found[:, 6]
+        each = [np.flatnonzero(found[:, 0] == frame) for frame in frames]
+        return cls(
+            name=name,
+            frames=frames,
+            truth=TrackTable(
+                frames=labels[:, 0].astype(int),
+                ids=labels[:, 1].astype(int),
+                boxes=_renamed(labels[:, 3:]),
+                ignored=labels[:, 2] > 0,
+            ),
+            boxes=[_renamed(found[rows, 7:14]) for rows in each],
+            scores=[scores[rows] for rows in each],
+            logits=logits,
+            poses=poses,
+            dont_care=dont_care,
+            projection=calibration.projection[_CAMERA],
+        )
+
+    def image_boxes(self, boxes: np.ndarray) -> np.ndarray:
+        """Left, top, right, bottom of boxes in the image, cut at its edges [pixels], shape (k, 4)."""
+        corners = box_corners(boxes) @ _AXES[:3, :3]  # back into the camera's axes
+        homogeneous = np.concatenate([corners, np.ones((*corners.shape[:2], 1))], axis=2) @ self.projection.T
+        uv = homogeneous[..., :2] / np.maximum(homogeneous[..., 2:], 0.1)
+        return np.concatenate([np.clip(edge, 0.0, _IMAGE) for edge in (uv.min(1), uv.max(1))], axis=1)
+
+    def ignorable(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+        """KITTI's rule for results: not above 25 pixels high, or more than half in an area without labels."""
+        low, high = np.split(self.image_boxes(boxes), 2, axis=1)
+        ignored = high[:, 1] - low[:, 1] <= _LEAST_HEIGHT
+        area = np.prod(high - low, axis=1)
+        for row, frame in enumerate(frames):
+            areas = self.dont_care.get(int(frame))
+            if areas is not None:
+                inner = np.minimum(high[row], areas[:, 2:]) - np.maximum(low[row], areas[:, :2])
+                ignored[row] |= bool((inner.clip(0).prod(1) > 0.5 * area[row]).any())
+        return ignored
+
+
+def _renamed(camera_boxes: np.ndarray) -> np.ndarray:
+    """KITTI's h w l x y z ry as x y z l w h yaw in the renamed frame."""
+    h, w, length, x, y, z, ry = np.asarray(camera_boxes, float).reshape(-1, 7).T
+    return np.stack([z, -x, 0.5 * h - y, length, w, h, -ry - 0.5 * np.pi], axis=1)
+
+
+def _camera_boxes(boxes: np.ndarray) -> np.ndarray:
+    """The inverse of `_renamed`."""
+    x, y, z, length, w, h, yaw = np.asarray(boxes, float).reshape(-1, 7).T
+    ry = np.remainder(-yaw - 0.5 * np.pi + np.pi, 2.0 * np.pi) - np.pi
+    return np.stack([h, w, length, -y, 0.5 * h - z, x, ry], axis=1)
+
+
+def _read_labels(path: pathlib.Path, kind: ObjectType) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Rows of frame, id, ignored, h w l x y z ry, by frame; and the areas without labels."""
+    rows: list[list[float]] = []
+    areas: dict[int, list[list[float]]] = {}
+    try:
+        for line in path.read_text().splitlines():
+            field = line.split()
+            if field[2] == "DontCare":
+                areas.setdefault(int(field[0]), []).append([float(v) for v in field[6:10]])
+            elif field[2] == kind.name or field[2] in kind.neighbours:
+                cut_off, hidden = float(field[3]) > _MOST_TRUNCATION, int(field[4]) > _MOST_OCCLUSION
+                ignored = field[2] != kind.name or hidden or cut_off
+                rows.append([float(field[0]), float(field[1]), ignored, *(float(v) for v in field[10:17])])
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}") from error
+    except (IndexError, ValueError) as error:
+        raise SourceError(f"{path}: not a label file of KITTI's tracking set: {error}") from error
+    table = np.array(rows).reshape(-1, 10)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    return table, {frame: np.array(each) for frame, each in areas.items()}
+
+
+def write_results(path: pathlib.Path, sequence: TrackingSequence, kind: ObjectType, tracks: TrackTable) -> None:
+    """Writes tracks as KITTI wants results: frame id type 0 0 alpha, image box, h w l x y z ry, score."""
+    camera = _camera_boxes(tracks.boxes)
+    image = sequence.image_boxes(tracks.boxes)
+    scores = np.zeros(len(camera)) if tracks.scores is None else tracks.scores
+    alpha = camera[:, 6] - np.arctan2(camera[:, 3], camera[:, 5])
+    alpha = np.remainder(alpha + np.pi, 2.0 * np.pi) - np.pi
+    with path.open("w") as file:
+        for k in range(len(camera)):
+            numbers = " ".join(f"{v:.6f}" for v in (alpha[k], *image[k], *camera[k]))
+            file.write(f"{tracks.frames[k]} {tracks.ids[k]} {kind.name} 0 0 {numbers} {scores[k]:.9g}\n")
