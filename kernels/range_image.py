@@ -17,171 +17,30 @@ import warp as wp
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .range_pixels import (
+    EMPTY,
+    SEARCH_FROM,
+    View,
+    draw_pixels,
+    draw_pixels_in_parts,
+    find_nearest,
+    find_nearest_in_parts,
+    find_rows,
+)
+from .threads import launch_parts, thread_count
 
 __all__ = ["RangeImage", "RangeProjection", "range_image"]
 
-# Which pixel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
-wp.set_module_options({"fuse_fp": False})
-
-_RANGE, _X, _Y, _Z, _INTENSITY = (wp.constant(i) for i in range(5))
-_EMPTY = wp.constant(wp.int64(2**63 - 1))
-_INDEX_BITS = wp.constant(wp.int64(32))
-_INDEX_MASK = wp.constant(wp.int64(0x7FFFFFFF))
-_OUTSIDE = wp.constant(-1)  # the row above the image; bins that hold less have an edge in them,
-_SEARCH_FROM = wp.constant(-3)  # and the row above it is this less what they hold
 _SINE_SLACK = 1e-6  # more than float32 errs in the sine of an elevation
 _TURN_SLACK = 2e-6  # and in the share of a turn
 _BINS_PER_ROW = 32
 _MOST_COLUMNS = 1 << 16
+_LEAST_OF_PART = 8192  # points or pixels for which a thread of their own is worth its while
 
 
-@wp.struct
-class _View:
-    rows: int
-    columns: int
-    top_sine: float
-    bins_per_sine: float
-    place_slack: float
-
-
-@wp.func
-def _share_of_turn(ratio: float) -> float:
-    """The arc tangent of 0 … 1 over 2π, within 6e-7."""
-    square = ratio * ratio
-    fourth = square * square
-    low = 0.15915423 - 0.052996794 * square
-    middle = 0.031129001 - 0.019275236 * square
-    high = 0.0091244903 - 0.0021362182 * square
-    return ratio * (low + fourth * (middle + fourth * high))
-
-
-@wp.func
-def _column_of(x: float, y: float, edges: wp.array(dtype=wp.vec2d), view: _View) -> int:
-    """The column of a direction, counted clockwise from straight behind."""
-    wide = wp.max(wp.abs(x), wp.abs(y))
-    turn = _share_of_turn(wp.where(wide > 0.0, wp.min(wp.abs(x), wp.abs(y)) / wide, 0.0))
-    turn = wp.where(wp.abs(y) > wp.abs(x), 0.25 - turn, turn)
-    turn = wp.where(x < 0.0, 0.5 - turn, turn)
-    place = wp.where(y < 0.0, 0.5 + turn, 0.5 - turn) * float(view.columns)
-    column = int(place)
-    edge = int(place + 0.5)
-    if wp.abs(place - float(edge)) < view.place_slack:
-        ray = edges[edge]
-        column = edge
-        if ray[0] * wp.float64(y) > ray[1] * wp.float64(x):  # counter-clockwise of the edge
-            column = edge - 1
-        column = (column + view.columns) % view.columns
-    return column
-
-
-@wp.func
-def _row_of(
-    p: wp.vec3,
-    distance: float,
-    sines: wp.array(dtype=wp.float64),
-    row_of_bin: wp.array(dtype=wp.int32),
-    view: _View,
-) -> int:
-    """The row whose upper edge is at or above a point and whose lower edge is below it; -1 and `rows` are outside."""
-    bin = int((view.top_sine - p[2] / distance) * view.bins_per_sine)
-    row = row_of_bin[wp.clamp(bin, 0, row_of_bin.shape[0] - 1)]
-    if row < _OUTSIDE:
-        row = _SEARCH_FROM - row
-        x = wp.float64(p[0])
-        y = wp.float64(p[1])
-        z = wp.float64(p[2])
-        exact = wp.sqrt(x * x + y * y + z * z)
-        while row < view.rows and z <= sines[row + 1] * exact:
-            row += 1
-    return row
-
-
-@wp.kernel
-def _find_rows(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    ring_in: wp.array(dtype=wp.uint16),
-    count_in: wp.array(dtype=wp.int32),
-    sines_in: wp.array(dtype=wp.float64),
-    row_of_bin_in: wp.array(dtype=wp.int32),
-    view: _View,
-    # out
-    row_out: wp.array(dtype=wp.int32),
-    distance_out: wp.array(dtype=wp.float32),
-):
-    """The row of each point, -1 outside the image, and its range. Apart from columns: a CPU is faster so."""
-    i = wp.tid()
-    if i >= count_in[0]:
-        return
-    p = xyz_in[i]
-    distance = wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-    row = int(_OUTSIDE)
-    # Written so that NaN is nowhere.
-    if distance > 0.0 and distance < float(wp.inf):
-        if ring_in:
-            row = view.rows - 1 - int(ring_in[i])
-        else:
-            row = _row_of(p, distance, sines_in, row_of_bin_in, view)
-    row_out[i] = wp.where(row < view.rows, row, _OUTSIDE)
-    distance_out[i] = distance
-
-
-@wp.kernel
-def _find_nearest(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    row_in: wp.array(dtype=wp.int32),
-    distance_in: wp.array(dtype=wp.float32),
-    edges_in: wp.array(dtype=wp.vec2d),
-    view: _View,
-    # in out: `_EMPTY` where there is none
-    nearest: wp.array(dtype=wp.int64),
-):
-    """Per pixel the nearest point, the first of equals."""
-    i = wp.tid()
-    if i >= count_in[0]:
-        return
-    row = row_in[i]
-    if row <= _OUTSIDE:
-        return
-    p = xyz_in[i]
-    pixel = row * view.columns + _column_of(p[0], p[1], edges_in, view)
-    # The bits of a positive float are in the order of its value.
-    wp.atomic_min(nearest, pixel, (wp.int64(wp.cast(distance_in[i], wp.int32)) << _INDEX_BITS) | wp.int64(i))
-
-
-@wp.kernel
-def _draw_pixels(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    intensity_in: wp.array(dtype=wp.float32),
-    # in out: left empty
-    nearest: wp.array(dtype=wp.int64),
-    # out
-    channels_out: wp.array2d(dtype=wp.float32),
-    index_out: wp.array(dtype=wp.int32),
-):
-    """Each pixel takes its point, and clears the workspace."""
-    pixel = wp.tid()
-    key = nearest[pixel]
-    index = int(-1)
-    distance = float(0.0)
-    p = wp.vec3(0.0)
-    intensity = float(0.0)
-    if key != _EMPTY:
-        nearest[pixel] = _EMPTY
-        index = int(key & _INDEX_MASK)
-        distance = wp.cast(int(key >> _INDEX_BITS), wp.float32)
-        p = xyz_in[index]
-        if intensity_in:
-            intensity = intensity_in[index]
-    channels_out[_RANGE, pixel] = distance
-    channels_out[_X, pixel] = p[0]
-    channels_out[_Y, pixel] = p[1]
-    channels_out[_Z, pixel] = p[2]
-    channels_out[_INTENSITY, pixel] = intensity
-    index_out[pixel] = index
+def _in_parts(device: str) -> bool:
+    """Whether few threads do much each, as suits a CPU, or many little."""
+    return device == DEFAULT_DEVICE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +76,7 @@ class RangeProjection:
             raise ValueError(f"shape {self.shape} has more pixels than 2³¹ − 1")
         device = resolve_device(self.device)
         sines = np.sin(np.deg2rad(self._row_edges()))
-        view = _View()
+        view = View()
         view.rows, view.columns = rows, columns
         view.top_sine, view.bins_per_sine, row_of_bin = _bins_of_sines(sines)
         view.place_slack = columns * _TURN_SLACK
@@ -229,9 +88,11 @@ class RangeProjection:
         keep("_edges", wp.array(_column_edges(columns), dtype=wp.vec2d, device=device))
         keep("_sines", wp.array(sines, dtype=wp.float64, device=device))
         keep("_row_of_bin", wp.array(row_of_bin, dtype=wp.int32, device=device))
+        keep("_parts", thread_count() if _in_parts(device) else 0)
         keep("_row", wp.zeros(self.capacity, dtype=wp.int32, device=device))
-        keep("_distance", wp.zeros(self.capacity, dtype=wp.float32, device=device))
-        keep("_nearest", wp.full(rows * columns, 2**63 - 1, dtype=wp.int64, device=device))
+        keep("_distance", wp.zeros(0 if self._parts else self.capacity, dtype=wp.float32, device=device))
+        images = (self._parts, rows * columns) if self._parts else rows * columns
+        keep("_nearest", wp.full(images, EMPTY, dtype=wp.int64, device=device))
         keep("channels", wp.zeros((5, rows, columns), dtype=wp.float32, device=device))
         keep("index", wp.full((rows, columns), -1, dtype=wp.int32, device=device))
         keep("_flat", (self.channels.reshape((5, rows * columns)), self.index.reshape(rows * columns)))
@@ -283,22 +144,30 @@ class RangeProjection:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         if ring is not None and (ring.shape[0] < n or ring.dtype != wp.uint16):
             raise ValueError(f"ring must be uint16 with at least {n} rows, as there are points")
+        if self._parts:
+            images = max(1, min(self._parts, n // _LEAST_OF_PART))
+            inputs = [xyz, ring, count, self._sines, self._row_of_bin, self._edges, self._view]
+            launch_parts(find_nearest_in_parts, images, inputs, [self._row, self._nearest])
+            parts = max(1, min(self._parts, index.shape[0] // _LEAST_OF_PART))
+            inputs = [xyz, intensity, images, self._nearest]
+            launch_parts(draw_pixels_in_parts, parts, inputs, [channels, index])
+            return
         wp.launch(
-            _find_rows,
+            find_rows,
             n,
             inputs=[xyz, ring, count, self._sines, self._row_of_bin, self._view],
             outputs=[self._row, self._distance],
             device=self.device,
         )
         wp.launch(
-            _find_nearest,
+            find_nearest,
             n,
             inputs=[xyz, count, self._row, self._distance, self._edges, self._view],
             outputs=[self._nearest],
             device=self.device,
         )
         wp.launch(
-            _draw_pixels,
+            draw_pixels,
             index.shape[0],
             inputs=[xyz, intensity, self._nearest],
             outputs=[channels, index],
@@ -318,7 +187,7 @@ def _bins_of_sines(sines: np.ndarray) -> tuple[float, float, np.ndarray]:
     slack = _SINE_SLACK + 1e-6 * width * inner
     above = np.searchsorted(-sines, -tops - slack, side="left") - 1
     below = np.searchsorted(-sines, -(tops - width) + slack, side="right") - 1
-    return tops[0], 1.0 / width, np.where(above == below, above, _SEARCH_FROM - above)
+    return tops[0], 1.0 / width, np.where(above == below, above, SEARCH_FROM - above)
 
 
 def _column_edges(columns: int) -> np.ndarray:

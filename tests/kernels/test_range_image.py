@@ -6,7 +6,10 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warploom.kernels import range_image as range_module
+from warploom.kernels.interop import borrow_points
 from warploom.kernels.range_image import RangeProjection, range_image
+from warploom.kernels.threads import set_thread_count, thread_count
 
 FOV = (-25.0, 3.0)
 VLP16 = np.arange(-15.0, 15.1, 2.0)
@@ -142,6 +145,33 @@ def test_any_layout_of_the_input():
     frozen.setflags(write=False)
     for given_points in (frozen, np.asfortranarray(points), points.astype(np.float64), np.repeat(points, 2, 0)[::2]):
         assert_equal(range_image(given_points, (16, 64)), expected)
+
+
+def launched(points, parts=None, ring=None):
+    before = thread_count()
+    try:
+        set_thread_count(parts or before)
+        plan = RangeProjection(capacity=len(points), shape=(64, 1024), device="cpu")
+    finally:
+        set_thread_count(before)
+    table = wp.array(points, dtype=wp.float32, device="cpu")
+    ring = None if ring is None else wp.array(ring, dtype=wp.uint16, device="cpu")
+    given_so = borrow_points(table)
+    for _ in range(2):  # the second finds the workspace as the first leaves it
+        plan.launch(given_so.xyz, given_so.intensity, wp.array([len(points)], dtype=wp.int32, device="cpu"), ring)
+    return plan.channels.numpy().tobytes(), plan.index.numpy().tobytes()
+
+
+@pytest.mark.parametrize("by_ring", [False, True])
+def test_parts_and_many_threads_give_the_same_bytes(by_ring, monkeypatch):
+    """Parts of a CPU, and the kernels of a GPU on a CPU."""
+    points = cloud(70_000, 5)
+    ring = np.random.default_rng(6).integers(0, 70, len(points)).astype(np.uint16) if by_ring else None
+    expected = launched(points, 1, ring)
+    for parts in (2, 3, 7):
+        assert launched(points, parts, ring) == expected
+    monkeypatch.setattr(range_module, "_in_parts", lambda _: False)
+    assert launched(points, None, ring) == expected
 
 
 def test_arrays_of_other_families():
