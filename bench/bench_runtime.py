@@ -1,0 +1,282 @@
+"""The mesh and the engine: commits, the way from a commit to the start of a processor, the engine's own time."""
+
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from warploom.bench.contest import record_figure
+from warploom.dag import (
+    BacklogConfig,
+    DagComponent,
+    DataProcessComponent,
+    DeadlineConfig,
+    GraphEngine,
+    In,
+    Out,
+    Processor,
+    Trigger,
+    Vertex,
+)
+from warploom.datamesh import CommitPolicy, DataMesh, Input, Output, Status
+
+DISCARD = CommitPolicy.DISCARD_OUT_OF_ORDER
+HAND_OFFS = 2000
+SWITCH_INTERVAL = 100e-6  # what a process sets while it runs
+EVERY = 0.5e-3  # [s] between commits, so that the component sleeps when one comes
+
+
+class Component(DataProcessComponent):
+    """Notes how long ago its datum, a time, was committed."""
+
+    sent: Input[int]
+
+    def process(self, trigger):
+        """Notes it."""
+        now = time.perf_counter_ns()
+        with self.sent.access() as snapshot:
+            self.context.append(now - snapshot[snapshot.version_index(trigger.version)])
+        return Status.OK
+
+
+class Noting(Processor):
+    """The same in a graph."""
+
+    sent: In[int]
+
+    def process(self, trigger):
+        """Notes it."""
+        self.context.append(time.perf_counter_ns() - self.sent.value)
+        return Status.OK
+
+
+class Nothing(Processor):
+    """Gives on what it takes."""
+
+    a: In[object]
+    b: In[object] = In(optional=True)
+    out: Out[object]
+
+    def process(self, trigger):
+        """Gives it on."""
+        self.out.value = self.a.value
+        return Status.OK
+
+
+class Works(Nothing):
+    """Computes in NumPy for a while."""
+
+    def process(self, trigger):
+        """Computes, then gives on."""
+        until = time.perf_counter_ns() + 100_000
+        while time.perf_counter_ns() < until:
+            self.context.sum()
+        return super().process(trigger)
+
+
+def output_of(mesh, topic):
+    output = Output()
+    output.bind("output", mesh.window(topic))
+    return output
+
+
+def commit(output, version, value=None):
+    """Commits the time at which it does so, unless another value is given."""
+    change = output.allocate_change()
+    change.set_version(version)
+    change.value = time.perf_counter_ns() if value is None else value
+    output.commit(DISCARD, change)
+
+
+@contextmanager
+def busy_thread(wanted):
+    """A thread that computes in Python all the time, if wanted."""
+    running = wanted
+
+    def spin():
+        number = 0
+        while running:
+            number += 1
+
+    thread = threading.Thread(target=spin)
+    if wanted:
+        thread.start()
+    yield
+    running = False
+    if wanted:
+        thread.join()
+
+
+@contextmanager
+def switch_interval(seconds):
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(seconds)
+    yield
+    sys.setswitchinterval(before)
+
+
+def bench_commit(benchmark):
+    """Commits to one topic, read by nobody, with all that belongs to one: allocate, version, value, commit."""
+    mesh = DataMesh()
+    output = output_of(mesh, "topic")
+    each, state = 2000, [0]
+
+    def commits():
+        start = time.thread_time()
+        for version in range(state[0], state[0] + each):
+            commit(output, version, version)
+        state[0] += each
+        taken.append(time.thread_time() - start)
+
+    taken = []
+    benchmark.extra_info.update(kernel="commit", on=f"{each} commits")
+    benchmark.pedantic(commits, rounds=40, warmup_rounds=3)
+    best, median = min(taken) / each * 1e6, np.median(taken) / each * 1e6
+    note = f"one core; {1e6 / best:,.0f} a second; median {median:.1f} µs"
+    record_figure(benchmark, "commit, best of 40", best, "µs", goal=10.0, note=note)
+
+
+def record_hand_off(benchmark, name, taken, goals=(40.0, 1000.0)):
+    microseconds = np.array(taken) / 1e3
+    note = f"of {len(taken)}; best tenth below {np.percentile(microseconds, 10):.0f} µs"
+    record_figure(benchmark, f"{name}, median", np.median(microseconds), "µs", goal=goals[0], note=note)
+    record_figure(benchmark, f"{name}, p99", np.percentile(microseconds, 99), "µs", goal=goals[1])
+
+
+@pytest.mark.parametrize("beside", ["idle", "busy"])
+@pytest.mark.parametrize("interval", [SWITCH_INTERVAL, 5e-3])
+def bench_condition_variable(benchmark, interval, beside):
+    """What a thread that waits for a plain condition variable needs, as a measure of the machine in this minute."""
+    condition, sent, taken = threading.Condition(), [], []
+
+    def serve():
+        while True:
+            with condition:
+                while not sent:
+                    condition.wait()
+                at = sent.pop()
+            if at is None:
+                return
+            taken.append(time.perf_counter_ns() - at)
+
+    def send(value):
+        with condition:
+            sent.append(value)
+            condition.notify()
+
+    def hand_offs():
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with busy_thread(beside == "busy"):
+            for _ in range(HAND_OFFS):
+                time.sleep(EVERY)
+                send(time.perf_counter_ns())
+        send(None)
+        thread.join()
+
+    benchmark.extra_info.update(kernel="condition variable", on=beside)
+    with switch_interval(interval):
+        benchmark.pedantic(hand_offs, rounds=1)
+    name = f"plain condition variable, {beside}, threads switch every {interval * 1e3:g} ms"
+    record_hand_off(benchmark, name, taken, (None, None))
+
+
+@pytest.mark.parametrize("beside", ["idle", "busy"])
+@pytest.mark.parametrize("hand_off", ["inline", "thread"])
+@pytest.mark.parametrize("kind", ["data", "dag"])
+def bench_hand_off(benchmark, kind, hand_off, beside):
+    """From before a commit to within the processor that it triggers, on a quiet machine or beside a busy thread."""
+    mesh, taken = DataMesh(), []
+    if kind == "data":
+        component = Component("component", taken)
+    else:
+        component = DagComponent("component")
+        component.add_handles(["sent"], [])
+    component.bind(mesh, {"sent": "sent"})
+    if isinstance(component, DagComponent):
+        processor = Noting()
+        processor.context = taken
+        component.set_graph([Vertex("vertex", processor, {"sent": "sent"}, {})], workers=2, in_flight=1)
+    component.set_trigger("sent", BacklogConfig(policy="fifo", depth=20), hand_off)
+    output = output_of(mesh, "sent")
+
+    def hand_offs():
+        component.start()
+        with busy_thread(beside == "busy"):
+            for number in range(HAND_OFFS):
+                time.sleep(EVERY)
+                commit(output, number)
+        component.stop()
+
+    benchmark.extra_info.update(kernel=f"hand-off, {kind}, {hand_off}", on=beside)
+    with switch_interval(SWITCH_INTERVAL):
+        benchmark.pedantic(hand_offs, rounds=1)
+    record_hand_off(benchmark, f"commit to start, {kind}, {hand_off}, {beside}", taken)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("shape", ["chain", "branches"])
+def bench_engine(benchmark, shape, workers):
+    """Frames through 20 vertices that do nothing: what the engine costs per vertex, start to end of the frame."""
+    vertices = []
+    for number in range(20):
+        source = "input" if number == 0 or shape == "branches" else f"v{number - 1}"
+        vertices.append(Vertex(f"v{number}", Nothing(), {"a": source}, {"out": f"v{number}"}))
+    engine = GraphEngine("graph", vertices, workers)
+    done, version = threading.Semaphore(0), [0]
+
+    def frame():
+        version[0] += 1
+        engine.submit(Trigger(version[0]), {"input": 0}, lambda run: done.release())
+        done.acquire()
+
+    engine.start()
+    benchmark.extra_info.update(kernel=f"engine, {workers} workers", on=f"20 vertices, {shape}")
+    with switch_interval(SWITCH_INTERVAL):
+        benchmark.pedantic(frame, rounds=1000, warmup_rounds=50)
+    engine.stop()
+    if benchmark.stats is not None:
+        median = benchmark.stats.stats.median / 20 * 1e6
+        name = f"engine per vertex, {shape}, {workers} workers"
+        record_figure(benchmark, name, median, "µs", goal=30.0, note="a frame of 20, from its submission to its end")
+
+
+def bench_deadlines(benchmark):
+    """A graph of 20 vertices, 0.1 ms of work in each, at 100 Hz on two workers, in five branches of four."""
+    mesh, timings = DataMesh(), []
+    component = DagComponent("component")
+    component.add_handles(["sent"], [])
+    component.bind(mesh, {"sent": "sent"})
+    data, vertices = np.ones(20_000), []
+    for number in range(20):
+        processor = Works()
+        processor.context = data
+        source = "sent" if number < 5 else f"v{number - 5}"
+        vertices.append(Vertex(f"v{number}", processor, {"a": source}, {"out": f"v{number}"}))
+    component.set_graph(vertices, workers=2, in_flight=1, on_timing=timings.append, deadline=DeadlineConfig(ms=10.0))
+    component.set_trigger("sent", BacklogConfig())
+    output, frames = output_of(mesh, "sent"), 300
+
+    def run():
+        component.start()
+        start = time.perf_counter()
+        for number in range(frames):
+            time.sleep(max(0.0, start + number / 100 - time.perf_counter()))
+            commit(output, number, number)
+        component.stop()
+
+    benchmark.extra_info.update(kernel="deadlines", on="20 vertices at 100 Hz")
+    with switch_interval(SWITCH_INTERVAL):
+        benchmark.pedantic(run, rounds=1)
+    losses = mesh.losses.as_dict().get("component", {})
+    missed = losses.get("deadline", 0) + losses.get("backlog", 0)
+    spans = [
+        max(t.end_ns for t in timings if t.version == version)
+        - min(t.ready_ns for t in timings if t.version == version)
+        for version in {t.version for t in timings}
+    ]
+    note = f"of {frames} frames, 10 ms each; 2 ms of work, done in {np.median(spans) / 1e6:.1f} ms (median)"
+    record_figure(benchmark, "deadlines missed, 20 vertices at 100 Hz", missed, "", goal=0.0, note=note)
