@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warploom.bench.contest import record_figure
+from warploom.bench.contest import peer, record_figure
 from warploom.components.pipeline import Pipeline
 from warploom.errors import ModelError
 from warploom.kernels.threads import launch_parts, thread_count
@@ -33,7 +33,9 @@ def _add_one_in_part(part: int, parts: int, values: wp.array(dtype=wp.int32)):
 
 def in_process(*arguments, cache=None):
     """Runs Python with its own kernel cache: seconds that it took, and what it printed."""
-    environment = {**os.environ} if cache is None else {**os.environ, "WARP_CACHE_PATH": str(cache)}
+    environment = {**os.environ}
+    if cache is not None:
+        environment |= {"WARP_CACHE_PATH": str(cache), "TI_OFFLINE_CACHE_FILE_PATH": str(cache / "taichi")}
     start = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True)
     seconds = time.perf_counter() - start
@@ -51,20 +53,24 @@ def bench_import(benchmark):
 
 
 @pytest.mark.slow
-def bench_compilation(benchmark, tmp_path):
+@pytest.mark.parametrize("backend", ["warp", "taichi"])
+def bench_compilation(benchmark, backend, tmp_path):
     """The first call of each function with an empty kernel cache, then with that cache filled, in new processes."""
-    benchmark.extra_info.update(kernel="compilation", on="cpu")
-    arguments = ("-m", "warploom.bench.first_calls")
+    if backend == "taichi":
+        peer("taichi")
+    benchmark.extra_info.update(kernel="compilation", on=f"cpu, {backend}")
+    arguments = ("-m", "warploom.bench.first_calls", backend)
     _, cold = benchmark.pedantic(in_process, args=arguments, kwargs={"cache": tmp_path}, rounds=1)
     _, warm = in_process(*arguments, cache=tmp_path)
     cold, warm = json.loads(cold), json.loads(warm)
     benchmark.extra_info["first_calls"] = {
         name: {"cold_s": cold[name][0], "warm_s": warm[name][0], "second_s": warm[name][1]} for name in cold
     }
+    what = "kernels of the API" if backend == "warp" else "kernels of the API in Taichi"
     everything = sum(first for first, _ in cold.values())
-    record_figure(benchmark, "kernels of the API, compiled", everything, "s", note=f"{len(cold)} functions")
+    record_figure(benchmark, f"{what}, compiled", everything, "s", note=f"{len(cold)} functions")
     everything = sum(first for first, _ in warm.values())
-    record_figure(benchmark, "kernels of the API, from the cache", everything, "s", note=f"{len(warm)} functions")
+    record_figure(benchmark, f"{what}, from the cache", everything, "s", note=f"{len(warm)} functions")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A process that calls each kernel twice: `python -m warploom.bench.first_calls` for what the first call costs."""
+"""What first calls cost, in a process of their own: `python -m warploom.bench.first_calls [BACKEND]`."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ import numpy as np
 __all__ = ["first_calls"]
 
 
-def first_calls() -> dict[str, tuple[float, float]]:
-    """Seconds of the first and the second call of each function of the API, on a small cloud on the CPU."""
+def first_calls(backend: str = "warp") -> dict[str, tuple[float, float]]:
+    """Seconds of the first and the second call of functions of the API, on a small cloud on the CPU.
+
+    Args:
+        backend: `warp`, or `taichi`, which has fewer of them.
+    """
     import warploom as wl
 
     points = np.random.default_rng(0).uniform((-20, -20, -2, 0), (20, 20, 2, 1), (5000, 4)).astype(np.float32)
@@ -30,6 +34,14 @@ def first_calls() -> dict[str, tuple[float, float]]:
         "bev": lambda: wl.bev(points, box, (80, 80)),
     }
 
+    if backend != "warp":
+        calls = {
+            "segment_ground": lambda: wl.segment_ground(points, backend=backend),
+            "cluster": lambda: wl.cluster(points, 0.5, backend=backend),
+            "voxelize": lambda: wl.voxelize(points, 0.5, box, backend=backend),
+            "bev": lambda: wl.bev(points, box, (80, 80), backend=backend),
+        }
+
     def seconds(call: Callable[[], Any]) -> float:
         start = time.perf_counter()
         call()
@@ -39,4 +51,4 @@ def first_calls() -> dict[str, tuple[float, float]]:
 
 
 if __name__ == "__main__":
-    json.dump(first_calls(), sys.stdout)
+    json.dump(first_calls(*sys.argv[1:]), sys.stdout)

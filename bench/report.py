@@ -267,8 +267,12 @@ def _row_of(pair: Pair, with_one_thread: bool) -> tuple[str, ...]:
 
 
 def _first_calls(measured: dict[str, Any]) -> Iterator[str]:
-    for _, calls in _of_all(measured, "first_calls"):
-        yield from ("## First calls", "", "In a new process, in this order: the first bears the imports.", "")
+    tables = list(_of_all(measured, "first_calls"))
+    if not tables:
+        return
+    yield from ("## First calls", "", "In a new process, in this order: the first bears the imports.", "")
+    for info, calls in tables:
+        yield from (f"### On {info['on']}", "")
         yield from _table(
             ("function", "empty kernel cache [s]:", "from the cache [s]:", "second call [ms]:"),
             (

@@ -115,7 +115,10 @@ def test_machine_versions_figures_stages_and_what_was_skipped_are_named(report_o
             "stats": {},
             "extra_info": {"on": "street", "stages": {"perception.ground": {"run_ms": 3.21, "wait_ms": 0.0}}},
         },
-        {"stats": {}, "extra_info": {"first_calls": {"cluster": {"cold_s": 2.5, "warm_s": 0.02, "second_s": 0.003}}}},
+        {
+            "stats": {},
+            "extra_info": {"on": "cpu", "first_calls": {"cluster": {"cold_s": 2.5, "warm_s": 0.02, "second_s": 0.003}}},
+        },
     )
     assert "Example 9000, 2 cores, 8.0 GiB" in text
     assert "2030-01-02" in text
