@@ -1,7 +1,7 @@
 """Voxel downsampling: one point per occupied voxel, the centroid of the points in it, the first, or a random one.
 
 Centroids are summed in fixed point, so the result does not depend on the order in which threads run: the same bytes
-on every run, on a CPU and on a GPU. A CPU goes through the points once, in order; a GPU shares a hash table.
+on every run, on a CPU and on a GPU. A CPU adds the points to their voxels in order; a GPU shares a hash table.
 """
 
 from __future__ import annotations
@@ -14,23 +14,27 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
+from .parts import parts_for
 from .plan import capacity_for, plan_for
+from .voxel_sums import VoxelSums
 
 __all__ = ["VoxelDownsample", "voxel_downsample"]
 
 # Which voxel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
+_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
 _FARTHEST = 2.0**20  # [m]; float32 has steps of 6 cm there
 _LARGEST_CELL = 2.0**30
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))
 _DRAW, _MIX, _MIX_AGAIN = (wp.constant(wp.uint32(n)) for n in (0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35))
+_NEXT = wp.constant(65)  # slots: in the next block, since the neighbours in this one have slots of their own
 _NO_POINT = wp.constant(wp.int32(2**31 - 1))
 _NO_KEY = wp.constant(wp.int64(2**63 - 1))
 _FIRST = wp.constant(1)
 _MODES = ("centroid", "first", "random")
 # A voxel is one row, one cache line, of 64-bit numbers: cell x and y, cell z and slot, points, sums of x y z.
-_XY, _Z_SLOT, _COUNT, _SUM, _ROW_WIDTH = (wp.constant(i) for i in (0, 1, 2, 3, 8))
+_COUNT, _SUM, _ROW_WIDTH = (wp.constant(i) for i in (2, 3, 8))
 
 
 @wp.struct
@@ -107,83 +111,6 @@ def _centroid(sums: wp.array2d(dtype=wp.int64), row: int, scale: float) -> wp.ve
     )
 
 
-@wp.func
-def _add(rows: wp.array2d(dtype=wp.int64), voxel: int, points: wp.int64, x: wp.int64, y: wp.int64, z: wp.int64):
-    rows[voxel, _COUNT] = rows[voxel, _COUNT] + points
-    rows[voxel, _SUM] = rows[voxel, _SUM] + x
-    rows[voxel, _SUM + 1] = rows[voxel, _SUM + 1] + y
-    rows[voxel, _SUM + 2] = rows[voxel, _SUM + 2] + z
-
-
-@wp.kernel
-def _gather_in_order(
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    grid: _Grid,
-    # in out: table of voxel numbers, -1 where free, and left so
-    table: wp.array(dtype=wp.int32),
-    rows: wp.array2d(dtype=wp.int64),
-    # out
-    centroids_out: wp.array(dtype=wp.vec3),
-    centroid_count_out: wp.array(dtype=wp.int32),
-    dropped_out: wp.array(dtype=wp.int32),
-):
-    """One thread, point after point: adds each to its voxel; then the centroids, voxel after voxel."""
-    mask = table.shape[0] - 1
-    voxels = int(0)
-    dropped = int(0)
-    voxel = int(-1)
-    before = wp.vec3i(0, 0, 0)
-    # Neighbours in a scan are mostly neighbours in space: what a run of points adds to its voxel is added at once.
-    points = wp.int64(0)
-    x = wp.int64(0)
-    y = wp.int64(0)
-    z = wp.int64(0)
-    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        point = xyz_in[i]
-        if _is_usable(point, grid.limit):
-            cell = _cell_of(point, grid.inverse_size)
-            if voxel < 0 or _differ(cell, before):
-                if voxel >= 0:
-                    _add(rows, voxel, points, x, y, z)
-                points = wp.int64(0)
-                x = wp.int64(0)
-                y = wp.int64(0)
-                z = wp.int64(0)
-                before = cell
-                cell_xy = (wp.int64(cell[0]) << wp.int64(32)) | wp.int64(wp.uint32(cell[1]))
-                cell_z = wp.int64(cell[2])
-                slot = _hash(cell) & mask
-                voxel = table[slot]
-                while voxel >= 0 and (rows[voxel, _XY] != cell_xy or (rows[voxel, _Z_SLOT] >> wp.int64(32)) != cell_z):
-                    slot = (slot + 1) & mask
-                    voxel = table[slot]
-                if voxel < 0:
-                    voxel = voxels
-                    voxels += 1
-                    table[slot] = voxel
-                    rows[voxel, _XY] = cell_xy
-                    rows[voxel, _Z_SLOT] = (cell_z << wp.int64(32)) | wp.int64(slot)
-                    rows[voxel, _COUNT] = wp.int64(0)
-                    rows[voxel, _SUM] = wp.int64(0)
-                    rows[voxel, _SUM + 1] = wp.int64(0)
-                    rows[voxel, _SUM + 2] = wp.int64(0)
-            points += wp.int64(1)
-            x += _fixed(point[0], grid.scale)
-            y += _fixed(point[1], grid.scale)
-            z += _fixed(point[2], grid.scale)
-        else:
-            dropped += 1
-    if voxel >= 0:
-        _add(rows, voxel, points, x, y, z)
-    for v in range(voxels):
-        centroids_out[v] = _centroid(rows, v, grid.scale)
-        table[int(rows[v, _Z_SLOT] & wp.int64(0x7FFFFFFF))] = -1
-    centroid_count_out[0] = voxels
-    dropped_out[0] = dropped
-
-
 @wp.kernel
 def _choose_in_order(
     # in
@@ -216,7 +143,7 @@ def _choose_in_order(
                 slot = _hash(cell) & mask
                 voxel = table[slot]
                 while voxel >= 0 and _differ(cells[voxel], cell):
-                    slot = (slot + 1) & mask
+                    slot = (slot + _NEXT) & mask
                     voxel = table[slot]
                 if voxel < 0:
                     voxel = voxels
@@ -269,7 +196,7 @@ def _gather_shared(
     slot = _hash(cell) & mask
     found = wp.atomic_cas(table, slot, -1, i)
     while found >= 0 and _differ(_cell_of(xyz_in[wp.max(found, 0)], grid.inverse_size), cell):
-        slot = (slot + 1) & mask
+        slot = (slot + _NEXT) & mask
         found = wp.atomic_cas(table, slot, -1, i)
     slot_out[i] = slot
     wp.atomic_min(lowest, slot, i)
@@ -354,7 +281,9 @@ class VoxelDownsample:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
+    """`in_order` (in parts), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
+    parts: int | None = None
+    """How many parts are worked on at once, by the method `in_order`; by default as the threads are worth it."""
     centroids: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (capacity,), vec3 [m], ordered by the lowest index of a point in the voxel; in the modes `first` and
     `random` the points chosen."""
@@ -375,6 +304,8 @@ class VoxelDownsample:
             raise ValueError(f"mode must be 'centroid', 'first' or 'random', not {self.mode!r}")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
+        if self.parts is not None and not 1 <= self.parts <= 64:
+            raise ValueError(f"parts must be 1 to 64, not {self.parts}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
         slots = 2 << (self.capacity - 1).bit_length()
@@ -396,13 +327,14 @@ class VoxelDownsample:
 
         keep("_sequential", sequential)
         keep("_grid", grid)
-        keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
         keep("_sums", None)
         keep("_keys", None)
         buffers(self.capacity, wp.vec3, "centroids")
         buffers(0 if centroids else self.capacity, wp.int32, "chosen")
         keep("centroid_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("dropped", wp.zeros(1, dtype=wp.int32, device=device))
+        if not (sequential and centroids):
+            keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
         if not sequential:
             keep("_lowest", wp.full(slots, 2**31 - 1, dtype=wp.int32, device=device))
             buffers(self.capacity, wp.int32, "_slot", "_head", "_rank")
@@ -411,7 +343,7 @@ class VoxelDownsample:
             elif random:
                 keep("_keys", wp.full(slots, 2**63 - 1, dtype=wp.int64, device=device))
         elif centroids:
-            keep("_sums", wp.empty((self.capacity, _ROW_WIDTH), dtype=wp.int64, device=device))
+            keep("_summed", VoxelSums(self.capacity, self.parts or parts_for(self.capacity, _LEAST_PART), device))
         else:
             buffers(self.capacity, wp.vec3i, "_cells")
             buffers(self.capacity, wp.int32, "_slots")
@@ -434,7 +366,9 @@ class VoxelDownsample:
         given, results = [xyz, count, self._grid], [self.centroids, self.centroid_count]
         if self._sequential:
             if self.mode == "centroid":
-                run(_gather_in_order, 1, given, [self._table, self._sums, *results, self.dropped])
+                grid = self._grid
+                given = (grid.inverse_size, grid.limit, grid.scale)
+                self._summed.launch(xyz, count, given, *results, self.dropped)
             else:
                 workspace = [self._table, self._cells, self._slots, self._keys]
                 run(_choose_in_order, 1, given, [*workspace, self.chosen, *results, self.dropped])

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warploom.kernels.downsample import VoxelDownsample, voxel_downsample
-from warploom.kernels.interop import count_on
+from warploom.kernels.interop import borrow_points, count_on
 
 
 def reference(points, voxel_size):
@@ -72,6 +72,55 @@ def test_matches_the_reference_on_real_scans(shared_data):
         actual = voxel_downsample(points, 0.2)
         assert actual.shape == expected.shape
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1.6e-5)
+
+
+WAYS = [{"method": "in_order", "parts": parts} for parts in (1, 2, 3, 7)] + [{"method": "shared"}]
+
+
+@pytest.mark.parametrize("voxel_size", [0.05, 0.8, 50.0])
+def test_methods_and_parts_give_the_same_bytes_scan_after_scan(voxel_size):
+    plans = [VoxelDownsample(capacity=5000, voxel_size=voxel_size, **way) for way in WAYS]
+    for seed, n in enumerate((5000, 3, 0, 4000)):
+        points = street(seed, 5000)
+        points[::50, seed % 3] = np.nan
+        xyz = borrow_points(points).xyz
+        outputs = []
+        for plan in plans:
+            plan.launch(xyz, count_on(n, "cpu"))
+            voxels = int(plan.centroid_count.numpy()[0])
+            outputs.append((plan.centroids.numpy()[:voxels].tobytes(), plan.dropped.numpy().tobytes()))
+        assert all(output == outputs[0] for output in outputs)
+
+
+@pytest.mark.parametrize("way", WAYS, ids=str)
+def test_cells_that_all_want_the_same_slots_of_their_blocks(way):
+    """One cell of each block of 8 × 8: the table must find room for them beside it."""
+    corners = np.stack(np.meshgrid(*[8 * np.arange(40)] * 2), -1).reshape(-1, 2)
+    points = np.float32(np.c_[corners + 0.5, np.full(1600, 0.5)])
+    actual, dropped = launched(points, voxel_size=1.0, **way)
+    np.testing.assert_array_equal(actual, points)
+    assert dropped == 0
+
+
+@pytest.mark.parametrize("kind", ["on a line", "equal", "denormal", "far", "backwards", "columns first"])
+def test_awkward_clouds(kind):
+    rng = np.random.default_rng(8)
+    points = street(8, 3000)
+    if kind == "on a line":
+        points[:, 1:3] = 0
+    elif kind == "equal":
+        points[:] = points[0]
+    elif kind == "denormal":
+        points[:, :3] = rng.choice([-1e-45, 0.0, 1e-45], (3000, 3))
+    elif kind == "far":
+        points[::2, :3] += rng.choice([-1e5, 1e5], (1500, 3)).astype(np.float32)
+    made = {
+        "backwards": lambda: points[::-1].copy()[::-1],
+        "columns first": lambda: np.asfortranarray(points),
+    }.get(kind, lambda: points)()
+    expected = reference(points, 0.5)
+    # Two float32 steps at 1e5 m, and at 128 m.
+    np.testing.assert_allclose(voxel_downsample(made, 0.5), expected, rtol=0, atol=1.6e-2 if kind == "far" else 1.6e-5)
 
 
 @settings(max_examples=30, deadline=None)
@@ -167,6 +216,8 @@ def test_a_plan_refuses_what_does_not_fit():
         VoxelDownsample(voxel_size=1.0, capacity=0)
     with pytest.raises(ValueError, match="method must be"):
         VoxelDownsample(voxel_size=1.0, capacity=1, method="fast")
+    with pytest.raises(ValueError, match="parts must be 1 to 64, not 0"):
+        VoxelDownsample(voxel_size=1.0, capacity=1, parts=0)
     with pytest.raises(ValueError, match="capacity of 10"):
         VoxelDownsample(voxel_size=1.0, capacity=10).launch(wp.zeros(11, wp.vec3, device="cpu"), count_on(11, "cpu"))
 
