@@ -92,7 +92,7 @@ class Tracker:
         self._i = np.empty((0, 8), np.int64)
         self._version: int | None = None
         self._pose: np.ndarray | None = None
-        self._motion = (np.zeros(6), 1.0)  # the ego's last motion and the seconds it took
+        self._step = (np.eye(4), 1.0)  # the ego's last motion and the seconds it took
         self._frames = 0
         self._seconds = 0.0  # between this frame and the last
 
@@ -208,10 +208,10 @@ class Tracker:
                 self._f[:, _V] = self._f[:, _PXV] = 0.0
                 self._f[:, _PVV] = self._in_world.initial_pvv[self._i[:, _KIND]]
             elif self._pose is not None and seconds > 0.0:
-                self._motion = (_motion_of(invert(self._pose) @ pose), seconds)
+                self._step = (invert(self._pose) @ pose, seconds)
         elif self._pose is not None:
-            motion, over = self._motion
-            pose = self._pose @ _motion_to(motion * (seconds / over))
+            step, over = self._step
+            pose = self._pose @ _motion_to(_motion_of(step) * (seconds / over))
         self._pose = pose
         return pose
 
