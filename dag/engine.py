@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..datamesh import Status
@@ -40,6 +41,8 @@ class VertexTiming(NamedTuple):
     late: bool = False
     """Whether it ended later after `ready_ns` than its deadline allows."""
     epoch: int = 0
+    reads: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    """Epoch and version of what it read of inputs that did not trigger it, by input."""
 
     @property
     def wait_ms(self) -> float:
@@ -311,13 +314,16 @@ class GraphEngine:
                         run.data[datum] = processor.ports[name].value
         for port in processor.ports.values():
             port.clear()
+        reads = processor.reads
+        if reads:
+            processor.reads = {}
         end, ready = time.perf_counter_ns(), run.ready_ns.get(vertex, start)
         late = vertex.deadline_ns is not None and end - ready > vertex.deadline_ns
         if late:
             processor.losses.count(processor.place, "deadline", run.trigger.version)
         if self._on_timing is not None:
             version, epoch = run.trigger.version, run.trigger.epoch
-            timing = VertexTiming(self.name, vertex.name, version, ready, start, end, status, late, epoch)
+            timing = VertexTiming(self.name, vertex.name, version, ready, start, end, status, late, epoch, reads)
             self._tell(self._on_timing, timing)
         return True
 

@@ -115,6 +115,10 @@ class Processor:
         self.losses = LossCounters()
         self.flags: Mapping[str, Any] = {}
         """What the flag loaders of the process found."""
+        self.reads: dict[str, tuple[int, int]] = {}
+        """Epoch and version of what this run read of inputs that did not trigger it, by input; the timings tell it."""
+        self.recorded_reads: Callable[[Trigger], Mapping[str, tuple[int, int]]] | None = None
+        """In a replay: what the recorded run read. It is waited for, without a deadline, and nothing else is taken."""
         self.component_inputs: Mapping[str, Input] = {}
         self.component_outputs: Mapping[str, Output] = {}
         self.ports = declared_ports(type(self))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 from pydantic import Field
 
-from ..datamesh import CURRENT_EPOCH, CommitPolicy, EqualVersion, Input, Outcome, Reorder, Status, Waiting
+from ..datamesh import CURRENT_EPOCH, CommitPolicy, Entry, EqualVersion, Input, Outcome, Reorder, Status, Waiting
 from .processor import In, Out, Processor, ProcessorConfig
 from .trigger import Trigger
 
@@ -21,6 +22,27 @@ def _input_of(processor: Processor, name: str) -> Input:
         known = ", ".join(processor.component_inputs) or "none"
         raise ValueError(f"the component has no input {name!r}; it has: {known}")
     return processor.component_inputs[name]
+
+
+def _begin_waits(waits: Iterable[Callable[[Callable[[Waiting], None]], Waiting]], resume: Callable[[], None]) -> bool:
+    """Begins several waits, of which the last to end resumes; False where all have ended at once."""
+    lock = threading.Lock()
+    begun, ended, waiting = 0, 0, False
+
+    def on_end(_: Waiting) -> None:
+        nonlocal ended
+        with lock:
+            ended += 1
+            last = waiting and ended == begun
+        if last:
+            resume()
+
+    for begin in waits:
+        begin(on_end)
+        begun += 1
+    with lock:
+        waiting = ended < begun
+    return waiting
 
 
 class _GetRecentConfig(ProcessorConfig):
@@ -37,6 +59,7 @@ class GetRecentDagProcessor(Processor):
     """
 
     Config = _GetRecentConfig
+    waits = True
 
     value: Out[Any]
     version: Out[int]
@@ -49,23 +72,46 @@ class GetRecentDagProcessor(Processor):
         """
         self._input = _input_of(self, config.input)
         self._max_age = None if config.max_age_ms is None else round(config.max_age_ms * 1e6)
+        self._name = config.input
+        self._recorded: Waiting | None = None
+
+    def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
+        """Waits in a replay alone, for what the recorded run read."""
+        read = self.recorded_reads(trigger).get(self._name) if self.recorded_reads is not None else None
+        if read is None:
+            return False
+
+        def begin(on_end: Callable[[Waiting], None]) -> Waiting:
+            self._recorded = self._input.when(read[1], on_end, epoch=read[0])
+            return self._recorded
+
+        return _begin_waits([begin], resume)
 
     def process(self, trigger: Trigger) -> Status:
         """Gives value and version, or neither, which is a MISS."""
+        stream = getattr(self.context, "stream", None)
+        if self.recorded_reads is None:
+            found = self._look(trigger)
+        else:
+            waiting, self._recorded = self._recorded, None
+            found = waiting.entry if waiting is not None else None
+        if found is None:
+            return Status.MISS
+        self.value.value, self.version.value = found.read(stream), found.version
+        self.reads[self._name] = (found.epoch, found.version)
+        return Status.OK
+
+    def _look(self, trigger: Trigger) -> Entry | None:
         current = self._input.window.epoch
         epoch = current if trigger.epoch == CURRENT_EPOCH else min(trigger.epoch, current)
-        with self._input.access(epoch, getattr(self.context, "stream", None)) as snapshot:
+        with self._input.access(epoch) as snapshot:
             if trigger.epoch in (epoch, CURRENT_EPOCH):
                 index = snapshot.until(trigger.version)
-                old = index >= 0 and self._max_age is not None
-                if old and trigger.version - snapshot.versions[index] > (self._max_age or 0):
-                    index = -1
+                if index >= 0 and self._max_age is not None:
+                    index = index if trigger.version - snapshot.versions[index] <= self._max_age else -1
             else:
                 index = len(snapshot) - 1 if self._max_age is None else -1
-            if index < 0:
-                return Status.MISS
-            self.value.value, self.version.value = snapshot[index], snapshot.versions[index]
-        return Status.OK
+            return snapshot.entry(index) if index >= 0 else None
 
 
 @dataclass(frozen=True)
@@ -120,37 +166,38 @@ class AlignDagProcessor(Processor):
 
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits for all inputs at once."""
-        lock = threading.Lock()
-        left, waits = len(self._inputs), False
+        recorded = None if self.recorded_reads is None else self.recorded_reads(trigger)
 
-        def on_end(_: Waiting) -> None:
-            nonlocal left
-            with lock:
-                left -= 1
-                over = left == 0 and waits
-            if over:
-                resume()
+        def begin(name: str, on_end: Callable[[Waiting], None]) -> Waiting:
+            handle = self._inputs[name]
+            if recorded is None:
+                at = handle.window.clock.monotonic_ns() if trigger.at_ns is None else trigger.at_ns
+                waiting = handle.when(
+                    trigger.version,
+                    on_end,
+                    due_ns=at + self._timeout,
+                    tolerance_ns=self._tolerance,
+                    epoch=trigger.epoch,
+                )
+            else:
+                epoch, version = recorded[name]
+                waiting = handle.when(version, on_end, epoch=epoch)
+            self._waits[name] = waiting
+            return waiting
 
-        for name, handle in self._inputs.items():
-            clock = handle.window.clock
-            self._waits[name] = handle.when(
-                trigger.version,
-                on_end,
-                due_ns=(clock.monotonic_ns() if trigger.at_ns is None else trigger.at_ns) + self._timeout,
-                tolerance_ns=self._tolerance,
-                epoch=trigger.epoch,
-            )
-        with lock:
-            waits = left > 0
-        return waits
+        names = [name for name in self._inputs if recorded is None or name in recorded]
+        return _begin_waits([partial(begin, name) for name in names], resume)
 
     def process(self, trigger: Trigger) -> Status:
         """Gives what was found. OK if all was; else SHUTDOWN, TIMEOUT or MISS, and what is absent is counted."""
         waits, self._waits = self._waits, {}
         stream = getattr(self.context, "stream", None)
-        outcomes = {name: waiting.outcome or Outcome.TIMEOUT for name, waiting in waits.items()}
+        ended = {name: waits[name].outcome if name in waits else None for name in self._inputs}
+        outcomes = {name: outcome or Outcome.TIMEOUT for name, outcome in ended.items()}
         found = {name: waiting.entry for name, waiting in waits.items() if waiting.entry is not None}
-        absent = [name for name in waits if name not in found]
+        found = {name: found[name] for name in self._inputs if name in found}
+        self.reads.update({name: (entry.epoch, entry.version) for name, entry in found.items()})
+        absent = [name for name in self._inputs if name not in found]
         for name in absent:
             self.losses.count(self.place, f"{name} {outcomes[name].value}", trigger.version)
         if not absent or self._partial:

@@ -18,7 +18,7 @@ from warploom.dag import (
     Trigger,
     Vertex,
 )
-from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, ManualClock, Miss, Status
+from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, Input, ManualClock, Miss, Outcome, Status
 
 WAIT = 20.0
 FIFO, BLOCK = BacklogConfig(policy="fifo", depth=30), BacklogConfig(policy="block")
@@ -714,6 +714,32 @@ def test_a_data_process_that_hangs_at_the_stop_is_left_to_itself(topic, monkeypa
         component.start()
     hang.set()
     thread.join(WAIT)
+
+
+def test_a_data_process_may_wait_in_its_thread_and_a_stop_ends_that(topic):
+    mesh, outcomes, waits = DataMesh(), [], threading.Event()
+    given, side = topic(mesh.window("number")), topic(mesh.window("side"))
+    component = doubler(mesh)
+    component.inputs["side"] = Input()
+    component.inputs["side"].bind("side", mesh.window("side"))
+
+    def process(trigger):
+        waits.set()
+        waiting = component.inputs["side"].wait(trigger.version)
+        outcomes.append((waiting.outcome, waiting.entry and waiting.entry.value))
+        return Status.OK
+
+    component.process = process
+    for cycle in range(2):
+        component.start()
+        given.commit(cycle * 10 + 1)
+        assert waits.wait(WAIT)
+        side.commit(cycle * 10 + 1, "there")
+        given.commit(cycle * 10 + 2)
+        while len(outcomes) < cycle * 2 + 1:
+            threading.Event().wait(0.001)
+        component.stop()
+    assert outcomes == [(Outcome.FOUND, "there"), (Outcome.SHUTDOWN, None)] * 2
 
 
 def test_a_producer_that_comes_back_at_a_lower_version_is_followed_by_the_whole_chain(topic, started):

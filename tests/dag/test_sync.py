@@ -336,6 +336,53 @@ def test_what_a_device_still_writes_is_waited_for_when_it_is_given_on():
     assert event.waited == 1
 
 
+def test_in_a_replay_weak_sync_takes_what_the_recorded_run_read():
+    """Not what is there now: it waits for that, however long, also for nothing."""
+    mesh, resumed = Mesh("map"), []
+    harness = recent(mesh, max_age_ms=0)
+    harness.processor.recorded_reads = lambda trigger: {"map": (0, 20)} if trigger.version == 30 else {}
+    mesh.commit("map", 10)
+    assert harness.processor.begin(Trigger(30), lambda: resumed.append(1))
+    mesh.clock.advance(3600 * 1000 * MS)
+    assert resumed == []
+    mesh.commit("map", 20, 25)
+    assert resumed == [1]
+    assert harness.processor.process(Trigger(30)) is Status.OK
+    assert (harness.processor.value.value, harness.processor.version.value) == ("map 20", 20)
+    assert harness.run(Trigger(40)) == {}
+    assert harness.status is Status.MISS
+
+
+def test_in_a_replay_strong_sync_takes_what_the_recorded_run_found():
+    mesh = Mesh("camera", "radar")
+    mesh.commit("camera", 9, 10)
+    mesh.commit("radar", 10)
+    waiting = Waiting(mesh, tolerance_ms=5e-6)
+    waiting.processor.recorded_reads = lambda trigger: {"camera": (0, 9)}
+    assert not waiting.begin(Trigger(10))
+    status, aligned = waiting.end()
+    assert status is Status.TIMEOUT
+    assert aligned.versions == {"camera": 9}
+    assert aligned.absent == ("radar",)
+
+
+def test_what_was_read_is_in_the_timings(no_thread_left):
+    mesh, results, timings = Mesh("lidar", "camera", "result"), Results(), []
+    component = aligning(mesh, results, on_timing=timings.append)
+    component.start()
+    mesh.commit("camera", 10)
+    mesh.commit("lidar", 10, 20)
+    results.wait_for(10)
+    component.stop()
+    reads = {(one.vertex, one.version): dict(one.reads) for one in timings}
+    assert reads == {
+        ("align", 10): {"camera": (0, 10)},
+        ("collect", 10): {},
+        ("align", 20): {},
+        ("collect", 20): {},
+    }
+
+
 class Collect(Processor):
     """Gives what was aligned to the context."""
 
@@ -346,7 +393,9 @@ class Collect(Processor):
         return Status.OK
 
 
-def aligning(mesh, on_aligned, *, workers=1, in_flight=1, timeout_ms=60_000.0, kind=DagComponent, extra=()):
+def aligning(
+    mesh, on_aligned, *, workers=1, in_flight=1, timeout_ms=60_000.0, kind=DagComponent, extra=(), on_timing=None
+):
     """A component that aligns `camera` with its trigger `lidar`; it is given to `on_aligned`."""
     component = kind("fusion")
     component.add_handles(["lidar", "camera"], ["result"])
@@ -365,7 +414,7 @@ def aligning(mesh, on_aligned, *, workers=1, in_flight=1, timeout_ms=60_000.0, k
         )
     ]
     vertices += [Vertex("collect", collect, {"aligned": "aligned"}, {}), *extra]
-    component.set_graph(vertices, workers=workers, in_flight=in_flight)
+    component.set_graph(vertices, workers=workers, in_flight=in_flight, on_timing=on_timing)
     component.set_trigger("lidar", BacklogConfig(policy="fifo", depth=6))
     return component
 
