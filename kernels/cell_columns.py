@@ -107,6 +107,9 @@ def _layout_of(bounds: wp.array(dtype=wp.vec4i), parts: int, has_levels: int, mo
     layout.height = most[2] - least[2] + 1
     layout.levels = most[3] - least[3] + 1
     columns = layout.levels * layout.width * layout.depth
+    if layout.height > most_digits:
+        layout.high_digits = 0
+        return layout
     while (layout.height << (layout.shift + 1)) <= (columns >> (layout.shift + 1)):
         layout.shift += 1
     layout.low_digits = layout.height << layout.shift

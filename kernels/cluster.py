@@ -15,10 +15,10 @@ import numpy as np
 import warp as wp
 
 from .backend import uses_taichi
-from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns
+from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
-from .cluster_columns import join_borders, join_levels_in_order, join_own_columns, label_points
+from .cluster_columns import JoinedColumns, join_levels_in_order, label_points
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -138,22 +138,15 @@ class EuclideanCluster:
         if sequential:
             by_cell = CellColumns(self._radius, self.capacity)
             keep("_by_cell", by_cell)
+            keep("_joined", JoinedColumns(by_cell))
             cells = self.capacity + by_cell.parts
-            for name in ("_parent", "_members", "_column_root", "_places"):
-                keep(name, wp.empty(cells, dtype=wp.int32, device=device))
-            keep("_masks", wp.empty(self.capacity, dtype=wp.uint64, device=device))
+            keep("_members", wp.empty(cells, dtype=wp.int32, device=device))
             if self.radius_per_metre > 0:
                 slots = 2 << (self.capacity - 1).bit_length()
                 keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
                 keep("_cells", wp.empty(cells, dtype=wp.vec3i, device=device))
                 for name in ("_slots", "_cell_begin", "_cell_end"):
                     keep(name, wp.empty(cells, dtype=wp.int32, device=device))
-            # The adjacent columns first, and of them those that share a side.
-            flat = sorted({d[:2] for d in forward} - {(2, 2)}, key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
-            keep("_offsets", wp.array(np.array(flat, np.int32) - 2, dtype=wp.vec2i, device=device))
-            places = max(LEAST_MAP, MAP_PER_POINT * self.capacity)
-            keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=device))
-            keep("_root_map", wp.full(places, -2, dtype=wp.int32, device=device))
         else:
             buffers(wp.int32, "_cell_end")
             keep("_offsets", wp.array(offsets, dtype=wp.vec3i, device=device))
@@ -185,31 +178,24 @@ class EuclideanCluster:
             self._launch_shared(n)
 
     def _launch_in_order(self, n: int, given: list) -> None:
-        by_cell, radius = self._by_cell, self._radius
-        columns = [by_cell.ranges, by_cell.columns]
+        by_cell, radius, parent = self._by_cell, self._radius, self._joined.parent
+        columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
         by_cell.launch(*given)
-        cells = [by_cell.stacks, by_cell.points, radius]
-        by_cell.run(
-            join_own_columns,
-            [by_cell.layout, *columns, *cells, self._offsets],
-            [self._column_map, self._root_map, self._column_root, self._places, self._masks, self._parent],
-        )
+        self._joined.launch(by_cell.layout, *columns, radius)
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
             wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
 
-        if by_cell.parts > 1:
-            run(join_borders, [*columns, self._column_root, *cells], [self._parent])
         if self.radius_per_metre > 0:
             run(
                 join_levels_in_order,
-                [*columns, by_cell.stacks, by_cell.points, None, radius],
-                [self._table, self._parent, self._cells, self._slots, self._cell_begin, self._cell_end],
+                [*columns, None, radius],
+                [self._table, parent, self._cells, self._slots, self._cell_begin, self._cell_end],
             )
         run(
             label_points,
             [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, self.min_size],
-            [self._parent, self._members, self.labels[:n], self.cluster_count],
+            [parent, self._members, self.labels[:n], self.cluster_count],
         )
 
     def _launch_shared(self, n: int) -> None:

@@ -6,13 +6,15 @@ the columns at the borders between the parts, which are few.
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
-from .cell_columns import Layout, aligned, is_before, row_of
+from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns, Layout, aligned, is_before, row_of
 from .cell_pairs import Radius, find, hash_cell, join_levels, touch
+from .device import DEFAULT_DEVICE
 from .unchecked import at, put
 
-__all__ = ["join_borders", "join_levels_in_order", "join_own_columns", "label_points"]
+__all__ = ["JoinedColumns", "join_levels_in_order", "label_points"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -536,3 +538,47 @@ def label_points(
         put(labels_out, i, label)
         i += 1
     cluster_count_out[0] = clusters
+
+
+class JoinedColumns:
+    """Workspace to join the cells of columns that touch; `parent` tells the components."""
+
+    def __init__(self, by_cell: CellColumns):
+        """Makes it for whatever columns these can be."""
+        capacity = by_cell.points.shape[0]
+        places = max(LEAST_MAP, MAP_PER_POINT * capacity)
+        # The adjacent columns first, and of them those that share a side.
+        offsets = sorted(
+            [d for d in np.ndindex(5, 5) if d > (2, 2)], key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d)
+        )
+
+        def buffer(length: int, dtype: type = wp.int32) -> wp.array:
+            return wp.empty(length, dtype=dtype, device=DEFAULT_DEVICE)
+
+        self.by_cell = by_cell
+        self.parent = buffer(capacity + by_cell.parts)
+        """Of each cell one of its component, and of that itself."""
+        self.column_map = wp.full(places, -1, dtype=wp.int32, device=DEFAULT_DEVICE)
+        """Free between launches, with -1 everywhere."""
+        self._root_map = wp.full(places, int(_NO_COLUMN), dtype=wp.int32, device=DEFAULT_DEVICE)
+        self._offsets = wp.array(np.array(offsets, np.int32) - 2, dtype=wp.vec2i, device=DEFAULT_DEVICE)
+        self._column_root, self._places = buffer(capacity), buffer(capacity)
+        self._masks = buffer(capacity, wp.uint64)
+
+    def launch(
+        self, layout: wp.array, ranges: wp.array, columns: wp.array, stacks: wp.array, points: wp.array, radius: Radius
+    ) -> None:
+        """Joins the cells of columns such as `CellColumns` has; they may be those of some of its points."""
+        self.by_cell.run(
+            join_own_columns,
+            [layout, ranges, columns, stacks, points, radius, self._offsets],
+            [self.column_map, self._root_map, self._column_root, self._places, self._masks, self.parent],
+        )
+        if self.by_cell.parts > 1:
+            wp.launch(
+                join_borders,
+                1,
+                inputs=[ranges, columns, self._column_root, stacks, points, radius],
+                outputs=[self.parent],
+                device=DEFAULT_DEVICE,
+            )

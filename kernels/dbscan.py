@@ -9,14 +9,18 @@ eps / √3 make it quick: all points of a cell with enough of them are cores, an
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, is_near, radius_of, touch, unite
 from .cell_table import CellTable, cell_at, free_slot
+from .cluster_columns import JoinedColumns, label_points
+from .dbscan_columns import find_cores, label_others, map_columns, pick_cores, unmap_columns
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -273,6 +277,9 @@ class Dbscan:
     """Points that one launch can take."""
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
+    method: str = "auto"
+    """`in_order` (for a CPU, by columns of cells), `shared` (one thread per cell), or `auto`: `in_order` on a CPU, else
+    `shared`: equal results."""
     labels: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (capacity,), int32: clusters numbered by their lowest core from 0; -1 for noise."""
     core: wp.array = field(init=False, repr=False, compare=False)
@@ -287,22 +294,52 @@ class Dbscan:
         for name in ("min_points", "capacity"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.method not in ("auto", "in_order", "shared"):
+            raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
+        if self.method == "in_order" and device != DEFAULT_DEVICE:
+            raise ValueError(f"method 'in_order' needs the device {DEFAULT_DEVICE!r}, not {device!r}")
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
 
+        keep("_sequential", self.method != "shared" and device == DEFAULT_DEVICE)
         keep("_radius", radius_of(self.eps))
-        keep("_by_cell", CellTable(self._radius, self.capacity, device, indexed=True))
         keep("_no_include", wp.zeros(1, dtype=wp.uint8, device=device))
+        keep("labels", wp.empty(self.capacity, dtype=wp.int32, device=device))
+        keep("core", wp.empty(self.capacity, dtype=wp.bool, device=device))
+        keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
+        if self._sequential:
+            self._make_columns(keep)
+            return
+        keep("_by_cell", CellTable(self._radius, self.capacity, device, indexed=True))
         # The nearest cells first, and each beside the one opposite.
         forward = [d for d in np.ndindex(5, 5, 5) if d > (2, 2, 2)]
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         keep("_offsets", wp.array(np.stack([offsets, -offsets], 1).reshape(-1, 3), dtype=wp.vec3i, device=device))
-        for name in ("_near", "_core_size", "_lowest_core", "labels"):
+        for name in ("_near", "_core_size", "_lowest_core"):
             keep(name, wp.empty(self.capacity, dtype=wp.int32, device=device))
-        keep("core", wp.empty(self.capacity, dtype=wp.bool, device=device))
-        keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
+
+    def _make_columns(self, keep: Callable[[str, Any], None]) -> None:
+        by_cell = CellColumns(self._radius, self.capacity)
+        cells = self.capacity + by_cell.parts
+
+        def buffer(name: str, dtype: type = wp.int32, shape: int | tuple[int, int] = cells) -> None:
+            keep(name, wp.empty(shape, dtype=dtype, device=DEFAULT_DEVICE))
+
+        keep("_by_cell", by_cell)
+        keep("_of_cores", JoinedColumns(by_cell))
+        around = sorted(np.ndindex(5, 5), key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
+        keep("_around", wp.array(np.array(around, np.int32) - 2, dtype=wp.vec2i, device=DEFAULT_DEVICE))
+        places = self._of_cores.column_map.shape[0]
+        keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=DEFAULT_DEVICE))
+        keep("_core_ranges", wp.zeros(by_cell.parts, dtype=wp.vec4i, device=DEFAULT_DEVICE))
+        buffer("_neighbours", wp.vec2i, (by_cell.parts, len(around)))
+        buffer("_core_columns", wp.vec4i)
+        buffer("_core_stacks", wp.vec2i)
+        buffer("_core_points", wp.vec3)
+        for name in ("_near", "_core_cell", "_core_cell_of_point", "_members"):
+            buffer(name)
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -316,6 +353,9 @@ class Dbscan:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         if n == 0:
             self.cluster_count.zero_()
+            return
+        if self._sequential:
+            self._launch_in_order(xyz, count)
             return
         by_cell, radius, offsets, least = self._by_cell, self._radius, self._offsets, self.min_points
         begin, size, core_size, count_of_cells = (
@@ -358,6 +398,46 @@ class Dbscan:
             [by_cell.slot_of_point[:n], rank],
             [*by_cell.slots, self.labels, self.core, self.cluster_count],
         )
+
+    def _launch_in_order(self, xyz: wp.array, count: wp.array) -> None:
+        by_cell, of_cores, least = self._by_cell, self._of_cores, self.min_points
+        by_cell.launch(xyz, count, self._no_include, 0)
+        columns = [by_cell.ranges, by_cell.columns]
+        cells = [by_cell.stacks, by_cell.points]
+        on_map = [by_cell.layout, *columns]
+        around = [self._around, self._column_map, self._radius, least]
+        # Cores.
+        by_cell.run(
+            map_columns,
+            [*on_map, by_cell.cell_of_point, by_cell.point_count],
+            [self._column_map, self._core_cell_of_point, self.core],
+        )
+        by_cell.run(find_cores, [*on_map, *cells, *around], [self._neighbours, self._near])
+        # Their components, numbered by the lowest.
+        cores = [self._core_ranges, self._core_columns, self._core_stacks, self._core_points]
+        by_cell.run(
+            pick_cores,
+            [*columns, *cells, by_cell.order, self._near, least],
+            [*cores, self._core_cell, self._core_cell_of_point],
+        )
+        of_cores.launch(by_cell.layout, *cores, self._radius)
+        wp.launch(
+            label_points,
+            1,
+            inputs=[self._core_ranges, self._core_stacks, self._core_cell_of_point, 1],
+            outputs=[of_cores.parent, self._members, self.labels[: xyz.shape[0]], self.cluster_count],
+            device=self.device,
+        )
+        # The other points.
+        by_cell.run(
+            label_others,
+            [
+                *(*on_map, *cells, by_cell.order, self._near, self._core_stacks, self._core_points, self._core_cell),
+                *(of_cores.parent, self._members, *around),
+            ],
+            [self._neighbours, self.labels, self.core],
+        )
+        by_cell.run(unmap_columns, on_map, [self._column_map])
 
 
 def dbscan(points: Any, eps: float, min_points: int) -> Any:
