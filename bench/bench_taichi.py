@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 
+from warploom.bench.bench_clustering import RADIUS as GROWING
+from warploom.bench.bench_clustering import RADIUS_PER_METRE
+from warploom.bench.bench_clustering import SCANS as GROWING_SCANS
 from warploom.bench.bench_kernels import BEV_RANGE, BEV_SHAPE, PILLARS, RADIUS
 from warploom.bench.contest import Contender, peer, processors
 from warploom.bench.scans import SIZES
 from warploom.kernels.bev import bev
 from warploom.kernels.cluster import cluster
 from warploom.kernels.ground import segment_ground
+from warploom.kernels.interop import borrow_points
 from warploom.kernels.voxel import voxelize
 
 TAICHI = "warploom on Taichi"
@@ -68,6 +72,19 @@ def bench_cluster(contest, scan):
         lambda **options: cluster(points, RADIUS, **options),
         same_labels,
     )
+
+
+@pytest.mark.parametrize("scan", GROWING_SCANS)
+def bench_cluster_adaptive(contest, scan):
+    whole = contest.cloud(scan)
+    points = np.ascontiguousarray(whole[~segment_ground(whole).mask])
+
+    def call(backend):
+        if backend == "warp":
+            return cluster(points, GROWING, radius_per_metre=RADIUS_PER_METRE)
+        return peer("warploom.kernels.taichi.cluster").cluster(borrow_points(points), GROWING, 1, RADIUS_PER_METRE)
+
+    run(contest, "cluster, growing radius", f"{scan}, no ground", points, call, same_labels)
 
 
 def same_maps(ours, theirs):
