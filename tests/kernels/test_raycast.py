@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warploom.kernels.meshes import MeshSet
-from warploom.kernels.raycast import MATERIALS, LidarCast, _first_hit, raycast
+from warploom.kernels.raycast import MATERIALS, LidarCast, raycast
 from warploom.kernels.threads import set_thread_count, thread_count
 
 # float32 coordinates of up to about 60 m: a few units in the last place of a distance.
@@ -70,22 +70,6 @@ def fan(n, spread=0.02, seed=0):
     elevation = 0.4 * np.sin(azimuth * 3)
     directions = np.stack([np.cos(azimuth), np.sin(azimuth), elevation], axis=1).astype(np.float32)
     return np.zeros((n, 3), np.float32), directions
-
-
-@pytest.mark.parametrize("n", [1, 7, 8, 9, 3000])
-@pytest.mark.parametrize("spread", [1e-5, 0.002, 0.1])
-def test_near_rays_go_together_and_hit_what_each_alone_would(n, spread):
-    """To the byte what Warp's own query says of each ray, and what a brute force search says within rounding."""
-    vertices, faces, _, _ = soup(10, faces=400)
-    origins, directions = fan(n, spread)
-    hits = raycast(vertices, faces, origins, directions)
-    mesh = wp.Mesh(points=wp.array(vertices, dtype=wp.vec3), indices=wp.array(faces.ravel(), dtype=wp.int32))
-    alone = [wp.empty(n, dtype=dtype) for dtype in (wp.float32, wp.int32, wp.vec3)]
-    rays = [wp.array(array, dtype=wp.vec3) for array in (origins, directions)]
-    wp.launch(_first_hit, n, inputs=[mesh.id, *rays, 1e6], outputs=alone)
-    for got, expected in zip((hits.distance, hits.face, hits.normal), alone, strict=True):
-        assert np.array_equal(got, expected.numpy())
-    assert agrees(hits.distance, brute_force(vertices, faces, origins, directions)[0])
 
 
 @settings(max_examples=30, deadline=None)
