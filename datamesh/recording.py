@@ -174,7 +174,10 @@ class Recorder:
         self._digest_only = frozenset(digest_only)
         self._when_full = when_full
         self._losses = LossCounters()
-        self._queue: queue.Queue[_Event | None] = queue.Queue(_QUEUE)
+        # Without a lock in Python: to put something into it costs a commit next to nothing.
+        self._queue: queue.SimpleQueue[_Event | None] = queue.SimpleQueue()
+        self._room = threading.Condition()
+        self._waiting = 0
         self._channels: dict[str, int] = {}
         self._closing = threading.Event()
         self._clock: Clock = SystemClock()
@@ -224,10 +227,15 @@ class Recorder:
         if self.failure is not None:
             self._drop(event, "disk")
             return
-        try:
-            self._queue.put(event, block=self._when_full == "block")
-        except queue.Full:
-            self._drop(event, "queue_full")
+        if self._queue.qsize() >= _QUEUE:
+            if self._when_full == "drop":
+                self._drop(event, "queue_full")
+                return
+            with self._room:
+                self._waiting += 1
+                self._room.wait_for(lambda: self._queue.qsize() < _QUEUE)
+                self._waiting -= 1
+        self._queue.put(event)
 
     def _drop(self, event: _Event, reason: str) -> None:
         if event.kind is EventKind.COMMIT:
@@ -236,6 +244,9 @@ class Recorder:
 
     def _run(self) -> None:
         while (event := self._queue.get()) is not None:
+            if self._waiting:
+                with self._room:
+                    self._room.notify_all()
             if self.failure is not None:  # the queue is still emptied, so that nobody waits for room in it
                 self._drop(event, "disk")
                 continue
