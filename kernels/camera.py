@@ -6,6 +6,7 @@ Pixels are OpenCV's: integers are centres of pixels, so that an image reaches fr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -76,15 +77,16 @@ def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[
     camera.radial, camera.radial_below = wp.vec3(k1, k2, k3), wp.vec3(k4, k5, k6)
     camera.tangential = wp.vec2(p1, p2)
     camera.is_distorted = int(numbers.any())
-    camera.widest_squared = _fold(np.array([k3, k2, k1, 1.0]), np.array([k6, k5, k4, 1.0])) ** 2
+    camera.widest_squared = _fold((k1, k2, k3), (k4, k5, k6)) ** 2 if camera.is_distorted else np.inf
     return camera
 
 
-def _fold(above: np.ndarray, below: np.ndarray) -> float:
+@lru_cache(maxsize=64)
+def _fold(radial: tuple[float, float, float], radial_below: tuple[float, float, float]) -> float:
     """The tangent of the angle to the axis at which a radial distortion begins to fold the image onto itself."""
     r = np.linspace(0, _WIDEST, 20_001)
-    denominator = np.polyval(below, r * r)
-    rising = np.diff(r * np.polyval(above, r * r) / np.where(denominator == 0, np.nan, denominator)) > 0
+    denominator = np.polyval([*radial_below[::-1], 1.0], r * r)
+    rising = np.diff(r * np.polyval([*radial[::-1], 1.0], r * r) / np.where(denominator == 0, np.nan, denominator)) > 0
     rising &= denominator[1:] > 0
     return np.inf if rising.all() else float(r[np.argmin(rising)])
 

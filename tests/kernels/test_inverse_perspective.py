@@ -7,8 +7,10 @@ import warp as wp
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from warploom.kernels import inverse_perspective as ground_module
 from warploom.kernels.camera import camera_model
 from warploom.kernels.inverse_perspective import InversePerspective, inverse_perspective
+from warploom.kernels.threads import set_thread_count, thread_count
 
 SIZE = (640, 480)
 K = np.array([[500.0, 0, 322.3], [0, 510.0, 238.8], [0, 0, 1]])
@@ -121,6 +123,29 @@ def test_the_plan(device):
         assert np.array_equal(plan.seen.numpy(), expected.seen)
     with pytest.raises(ValueError, match="image must be contiguous uint8"):
         plan.launch(wp.array(image.astype(np.float32), device=device))
+
+
+@pytest.mark.parametrize("size", [SIZE, (1, 3), (3, 1), (2, 2), (7, 5)])
+def test_parts_and_many_threads_give_the_same_bytes(size, monkeypatch):
+    """Parts of a CPU, and the kernels of a GPU on a CPU; to the last byte of an image."""
+    image = wp.array(np.random.default_rng(4).integers(0, 256, (*size[::-1], 3)).astype(np.uint8), device="cpu")
+    k = np.array([[size[0] / 1.3, 0, size[0] / 2 - 0.5], [0, size[1] / 0.9, size[1] / 2 - 0.5], [0, 0, 1]])
+    before, drawn = thread_count(), set()
+    for parts in (1, 2, 3, 7, None):
+        if parts is None:
+            monkeypatch.setattr(ground_module, "_in_parts", lambda _: False)
+        try:
+            set_thread_count(parts or before)
+            plan = InversePerspective(image_size=size, bev_range=RANGE, shape=(401, 307), device="cpu")
+        finally:
+            set_thread_count(before)
+        plan.launch(image)
+        assert not plan.ground.numpy().any()
+        plan.set_camera(camera_model(np.linalg.inv(rig()), k))
+        plan.launch(image)
+        drawn.add(plan.ground.numpy().tobytes())
+    assert len(drawn) == 1
+    assert plan.seen.numpy().any()
 
 
 def test_a_camera_that_has_moved_is_noticed():
