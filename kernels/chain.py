@@ -16,7 +16,7 @@ import warp as wp
 
 from .bev import BevMaps
 from .boxes import FitBoxes
-from .chain_result import COUNTS, ChainResult, collect_counts, result_of
+from .chain_result import COUNTS, ChainResult, collect_counts, read_counts, result_of
 from .cluster import EuclideanCluster
 from .cpu_graph import CpuGraph, is_alone
 from .device import DEFAULT_DEVICE, resolve_device
@@ -341,6 +341,10 @@ class KernelChain:
             wp.copy(self.points, self._staged, count=n * _COLUMNS)
             wp.get_stream(self.device).record_event(self._uploaded)
         self.count.fill_(offered)
+
+    def read_counts(self) -> tuple[dict[str, int], float]:
+        """The counts of the last launch by the names of `COUNTS`, and the sensor's height [m]: it waits for them."""
+        return read_counts(self.counts)
 
     def result(self, family: Family | None = None, *, copy: bool = True) -> ChainResult:
         """What the last launch found, trimmed by its counts, which are read from the device: it waits for them.

@@ -14,7 +14,7 @@ from .voxel import Voxels
 if TYPE_CHECKING:
     from .chain import KernelChain
 
-__all__ = ["COUNTS", "ChainDropped", "ChainResult", "collect_counts", "result_of"]
+__all__ = ["COUNTS", "ChainDropped", "ChainResult", "collect_counts", "read_counts", "result_of"]
 
 COUNTS = (
     "kept",
@@ -185,10 +185,15 @@ class ChainResult:
     """Whether there was too little room: for points, boxes or pillars."""
 
 
+def read_counts(counts: wp.array) -> tuple[dict[str, int], float]:
+    """Waits for what `collect_counts` wrote: the counts by name, but for the last; and that, the sensor's height."""
+    host = counts.numpy()
+    return dict(zip(COUNTS[:-1], host.tolist(), strict=False)), float(host[-1:].view(np.float32)[0])
+
+
 def result_of(chain: KernelChain, family: Family, copy: bool) -> ChainResult:
     """Waits for the last launch of a chain and trims its arrays, as arrays of a family."""
-    host = chain.counts.numpy()
-    counts = {name: int(count) for name, count in zip(COUNTS, host, strict=True)}
+    counts, sensor_height = read_counts(chain.counts)
     m = counts["kept"]
 
     def out(array: wp.array | None) -> Any:
@@ -216,7 +221,7 @@ def result_of(chain: KernelChain, family: Family, copy: bool) -> ChainResult:
         index=trimmed(chain.index, m),
         ground=trimmed(chain.ground, m),
         height=trimmed(chain.height, m),
-        sensor_height=float(host[-1:].view(np.float32)[0]),
+        sensor_height=sensor_height,
         labels=trimmed(chain.labels, m),
         cluster_count=counts["clusters"],
         boxes=trimmed(chain.boxes, min(counts["clusters"], chain.config.max_boxes)),

@@ -1,6 +1,7 @@
 """The stages of perception as processors, each of which can be named in a module file and run alone."""
 
 from .background import BackgroundProcessor
+from .chain import ChainProcessor
 from .cluster_boxes import ClusterBoxProcessor
 from .clustering import ClusterProcessor
 from .detection import DetectionProcessor
@@ -12,6 +13,7 @@ from .tracking import TrackingProcessor
 
 __all__ = [
     "BackgroundProcessor",
+    "ChainProcessor",
     "ClusterBoxProcessor",
     "ClusterProcessor",
     "DetectionProcessor",
