@@ -113,6 +113,7 @@ class _Selection:
         self.names: list[str] = []
         self.selected = 0
         self.failures: list[str] = []
+        self.skipped: dict[str, None] = {}
 
     def pytest_collection_modifyitems(self, config: Any, items: list[Any]) -> None:
         self.names = sorted({item.originalname.removeprefix("bench_") for item in items})
@@ -144,6 +145,8 @@ class _Selection:
             lines = str(report.longrepr).strip().splitlines()
             name = report.nodeid.rpartition("::")[2]
             self.failures.append(f"{name} failed: {lines[-1].strip() if lines else 'for no reason that it gave'}")
+        if report.skipped and isinstance(report.longrepr, tuple):
+            self.skipped[report.longrepr[2].removeprefix("Skipped: ")] = None
         if report.when == "teardown":
             self._progress.advance(self._task)
 
@@ -179,8 +182,10 @@ def _measure(written: Path, filters: Sequence[str], device: str, quick: bool) ->
         )
     if code == pytest.ExitCode.INTERRUPTED and not selection.failures:
         raise KeyboardInterrupt
-    if not written.exists():
-        raise BenchmarkError("; ".join(selection.failures) or f"pytest ended with {code}: {said.getvalue()[-2000:]}")
+    if not written.exists() and (selection.failures or selection.skipped):
+        raise BenchmarkError("nothing was measured: " + "; ".join((*selection.failures, *selection.skipped)))
+    if not written.exists() or code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        raise BenchmarkError(f"pytest ended with {code!r}: {said.getvalue()[-2000:]}")
     return selection.failures
 
 

@@ -18,9 +18,10 @@ def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
     (folder / "pytest.ini").write_text("[pytest]\naddopts = --no-such-option\n")
 
-    def run(*arguments, expect=0):
+    def run(*arguments, expect=0, **environment):
         command = [sys.executable, "-c", "from warploom.cli import main; main()", "bench", *map(str, arguments)]
-        done = subprocess.run(command, cwd=folder, env=os.environ | {"COLUMNS": "250"}, capture_output=True, text=True)
+        environment = {**os.environ, "COLUMNS": "250", **environment}
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == expect, done.stdout + done.stderr
         return " ".join((done.stdout + done.stderr).split())
 
@@ -74,6 +75,11 @@ def test_an_earlier_run_stands_beside_the_new_one(first, bench):
 
 def test_a_name_that_no_benchmark_has_ends_with_2_and_those_that_there_are(bench):
     assert "no benchmark's name has 'abacus'; there are bev, chain, " in bench("--filter", "abacus", expect=2)
+
+
+def test_where_nothing_could_be_measured_it_says_why(bench):
+    output = bench("--filter", "launch_parts", "--out", "none", expect=1, WARPLOOM_THREADS="1")
+    assert "nothing was measured: one CPU thread is all that there is" in output
 
 
 def test_an_earlier_run_of_another_kind_is_refused_by_name(tmp_path):
