@@ -77,7 +77,8 @@ class GridCluster:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
+    """`in_order` (for a CPU, by columns of cells), `shared` (a thread per cell), or `auto`: `in_order` on a CPU, else
+    `shared`: equal results."""
     labels: wp.array = field(init=False, repr=False, compare=False)
     """Out: shape (capacity,), int32: clusters numbered by their lowest point from 0, or -1; as many set as points
     were given."""
@@ -96,7 +97,9 @@ class GridCluster:
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
-        sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
+        if self.method == "in_order" and device != DEFAULT_DEVICE:
+            raise ValueError(f"method 'in_order' needs the device {DEFAULT_DEVICE!r}, not {device!r}")
+        sequential = self.method != "shared" and device == DEFAULT_DEVICE
         axes = _AXES[self.connectivity]
         offsets = np.array([d for d in np.ndindex(3, 3, 3) if d > (1, 1, 1)], np.int32) - 1
         offsets = offsets[np.abs(offsets).sum(axis=1) <= axes]

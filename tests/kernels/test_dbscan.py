@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.cluster import DBSCAN
 
+from warploom.kernels import cell_columns
 from warploom.kernels.cluster import cluster
 from warploom.kernels.dbscan import Dbscan, dbscan
 from warploom.kernels.interop import count_on
@@ -119,6 +120,30 @@ def test_any_floats_at_all(rows, min_points):
     assert not core[~finite].any()
 
 
+@pytest.mark.parametrize("parts", [1, 2, 3, 7])
+def test_the_number_of_parts_does_not_change_labels_and_cores(monkeypatch, parts):
+    """Of a street, a tower taller than a mask, and a cloud too wide for the map; as many threads at once have it."""
+    monkeypatch.setattr(cell_columns, "parts_for", lambda capacity: parts)
+    rng = np.random.default_rng(11)
+    street = rng.normal(0, [9, 9, 1], (4_000, 3))
+    street[::90] = np.nan
+    tower = rng.uniform(0, 1, (3_000, 3)) * (2, 2, 80)
+    wide = np.concatenate([street[:1_500], street[:1_500] + np.array((9e4, -4e4, 2e4))])
+    for points in (street, tower, wide):
+        points = points.astype(np.float32)
+        expected = launched(points, eps=0.6, min_points=5, method="shared")
+        assert_same(launched(points, eps=0.6, min_points=5), expected)
+        finite = np.isfinite(points).all(axis=1)
+        assert_same((expected[0][finite], expected[1][finite]), sklearn(points[finite], 0.6, 5))
+
+
+@pytest.mark.parametrize("min_points", [1, 3, 8])
+def test_many_threads_at_once_give_scikit_learns_labels(device, min_points):
+    points = np.random.default_rng(9).normal(0, [4, 4, 1], (1_500, 3)).astype(np.float32)
+    actual = launched(points, device, eps=0.4, min_points=min_points, method="shared")
+    assert_same(actual, sklearn(points, 0.4, min_points))
+
+
 def test_with_single_points_as_cores_it_is_euclidean_clustering():
     points = np.random.default_rng(4).uniform(0, 9, (4_000, 3)).astype(np.float32)
     np.testing.assert_array_equal(dbscan(points, 0.4, 1), cluster(points, 0.4))
@@ -176,6 +201,8 @@ def test_a_wrong_argument_is_refused_by_name(arguments, message):
 def test_a_plan_refuses_more_points_than_it_has_room_for():
     with pytest.raises(ValueError, match="capacity of 10"):
         Dbscan(eps=1.0, min_points=2, capacity=10).launch(wp.zeros(11, wp.vec3, device="cpu"), count_on(11, "cpu"))
+    with pytest.raises(ValueError, match="method must be"):
+        Dbscan(eps=1.0, min_points=2, capacity=10, method="fast")
 
 
 def test_a_captured_launch_replays_on_other_points(device):
