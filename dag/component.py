@@ -225,6 +225,7 @@ class DataProcessComponent(Component):
         for output in self.outputs.values():
             if output.is_bound:
                 output.flush()
+        self.clock.tidy()
 
     def _finish(self) -> None:
         """Waits until all is served."""

@@ -24,6 +24,11 @@ class Timer:
         self.due_ns = due_ns
         self._callback: Callable[[], None] | None = callback
 
+    @property
+    def is_due(self) -> bool:
+        """Whether the call is still to be made."""
+        return self._callback is not None
+
     def cancel(self) -> None:
         """The call is not made, unless it is being made already."""
         self._callback = None
@@ -54,6 +59,10 @@ class Clock(Protocol):
         """Calls back once `monotonic_ns` has reached `due_ns`, in a thread of the clock: the call must be short."""
         ...
 
+    def tidy(self) -> None:
+        """Lets go of calls that were cancelled, and of the thread if no other is due."""
+        ...
+
 
 class SystemClock:
     """The machine's clock. Its one thread lives while a call is due."""
@@ -82,7 +91,7 @@ class SystemClock:
     def _serve(self) -> None:
         while True:
             with self._changed:
-                while self._due and self._due[0][2]._callback is None:
+                while self._due and not self._due[0][2].is_due:
                     heapq.heappop(self._due)
                 if not self._due:
                     self._thread = None
@@ -95,14 +104,24 @@ class SystemClock:
             timer.fire()
             del timer  # what was called must not live until the next call is due
 
+    def tidy(self) -> None:
+        """Lets go of calls that were cancelled, and of the thread if no other is due."""
+        with self._changed:
+            self._due = [one for one in self._due if one[2].is_due]
+            heapq.heapify(self._due)
+            thread = self._thread
+            self._changed.notify()
+        if thread is None or thread is threading.current_thread():
+            return
+        while thread.is_alive() and not self._due:  # a call that comes meanwhile keeps it
+            thread.join(0.01)
+
     def stop(self) -> None:
         """Makes none of the calls that are due, and ends the thread."""
         with self._changed:
-            thread = self._thread
-            self._due.clear()
-            self._changed.notify()
-        if thread is not None and thread is not threading.current_thread():
-            thread.join()
+            for _, _, timer in self._due:
+                timer.cancel()
+        self.tidy()
 
 
 class ManualClock:
@@ -147,6 +166,12 @@ class ManualClock:
                 timer = heapq.heappop(self._due)[2]
                 self._elapsed = max(self._elapsed, timer.due_ns)
             timer.fire()
+
+    def tidy(self) -> None:
+        """Lets go of calls that were cancelled."""
+        with self._lock:
+            self._due = [one for one in self._due if one[2].is_due]
+            heapq.heapify(self._due)
 
     def step(self, by_ns: int) -> None:
         """Sets the time of versions forward, or back, as when a clock is set: no time has passed."""

@@ -1,6 +1,7 @@
 """The kinds of components, each on a mesh, fed and watched from outside."""
 
 import threading
+import time
 
 import pytest
 from graph_parts import Call, Doubler
@@ -649,6 +650,22 @@ def test_a_component_runs_by_time_on_the_clock(kind, topic):
     assert ran == [*expected, (1, 100_000_000)]
     clock.advance(1_000_000_000)
     assert len(ran) == 4
+
+
+def test_by_the_machines_clock_a_component_ticks_stops_and_leaves_no_thread(topic):
+    mesh, ran = DataMesh(), []
+    result = topic(mesh.window("output"))
+    component = dag(mesh, lambda t, v: ran.append(t.version), trigger={"period_ms": 2}, reads=())
+    for _ in range(2):
+        component.start()
+        seen = len(result.entries) + 3
+        until = time.monotonic() + WAIT
+        while len(result.entries) < seen and time.monotonic() < until:
+            time.sleep(0.001)
+        component.stop()
+    assert ran == sorted(set(ran))
+    assert len(ran) >= 6
+    assert all(version > 1_700_000_000 * 10**9 for version in ran), "versions are the time of day"
 
 
 @pytest.mark.parametrize(("overrun", "expected"), [("skip", [1, 5]), ("coalesce", [1, 4, 5])])

@@ -86,6 +86,23 @@ def test_the_systems_clock_calls_not_before_it_is_due_and_leaves_no_thread():
     assert again.wait(WAIT)
 
 
+@pytest.mark.parametrize("make", [ManualClock, SystemClock])
+def test_a_tidy_clock_keeps_what_is_due_and_no_thread_for_what_is_not(make):
+    clock, called = make(), threading.Event()
+    start = clock.monotonic_ns()
+    far = [clock.call_at(start + 3600 * 1000 * MS, lambda: None) for _ in range(100)]
+    clock.call_at(start + 5 * MS, called.set)
+    for timer in far:
+        timer.cancel()
+    clock.tidy()
+    assert len(clock._due) <= 1
+    if make is ManualClock:
+        clock.advance(5 * MS)
+    assert called.wait(WAIT)
+    clock.tidy()
+    assert make is ManualClock or clock._thread is None
+
+
 def test_a_stopped_clock_makes_no_call_that_was_due():
     clock, calls = SystemClock(), []
     clock.call_at(clock.monotonic_ns() + 3600 * 1000 * MS, lambda: calls.append(1))
