@@ -162,7 +162,8 @@ def next_scans(make, scans):
     return lambda: next(results)
 
 
-ODOMETERS = contenders("kiss-icp, one thread", "kiss-icp, all threads", "small_gicp, all threads")
+# KISS-ICP keeps the number of threads that it was first given in a process, so that only one can be tried.
+ODOMETERS = contenders("kiss-icp, all threads", "small_gicp, all threads")
 
 
 @pytest.mark.parametrize("contender", [c for c in ODOMETERS if c.values[0].who != "warploom plan"])
@@ -174,7 +175,6 @@ def bench_odometry(contest, contender, drive):
         pytest.skip(str(error))
     makers = {
         "warploom": lambda: ours(contender.device),
-        "kiss-icp, one thread": lambda: KissIcp(1),
         "kiss-icp, all threads": lambda: KissIcp(processors()),
         "small_gicp, all threads": lambda: SmallGicp(processors()),
     }
@@ -203,6 +203,6 @@ def bench_odometry(contest, contender, drive):
         on=f"{drive} drive",
         size=int(np.median([len(points) for points in scans])),
         score=drift,
-        goals={"kiss-icp, one thread": 1 / 2, "kiss-icp, all threads": 1 / 2},
+        goals={"kiss-icp, all threads": 1 / 2},
         threads={"kiss-icp, all threads": processors(), "small_gicp, all threads": processors()},
     )
