@@ -6,12 +6,17 @@ import warp as wp
 
 import warploom as wl
 from warploom.bench.contest import on_device, record_figure
+from warploom.bench.long_run import cycled
 from warploom.bench.scans import REAL
+from warploom.components.pipeline import Pipeline
+from warploom.errors import ModelError
 from warploom.kernels.threads import thread_count
 
 SCANS = ("street 10k", "street 120k", REAL)
 CONFIG = wl.ChainConfig()
 WHAT = "filter, ground, clusters, boxes, pillars, BEV maps"
+FRAMES = 30
+GPU_PROFILES = [pytest.param(name, marks=pytest.mark.cuda) for name in ("gpu", "gpu-chain")]
 GOALS = {"cpu": 12.0, "cuda:0": 0.3}  # [ms] of a whole scan
 WHOLE = ("street 120k", REAL)
 
@@ -101,3 +106,30 @@ def bench_chain_upload(benchmark, contest, scan):
     record(benchmark, f"kernel chain, upload and launch, {scan}, cuda:0", points, "cuda:0")
     given = on_device(points, "cuda:0")
     assert len(chain(given).labels) == len(chain(points).labels)
+
+
+@pytest.mark.parametrize("profile", ["cpu", "cpu-chain", *GPU_PROFILES])
+def bench_frame_with_chain(benchmark, contest, profile):
+    """The main job with single stages and with the chain as one: from the frame to the labels of its points."""
+    if profile.startswith("gpu") and not wp.is_cuda_available():
+        pytest.skip("no CUDA device here")
+    try:
+        made = Pipeline.from_profile(profile)
+    except ModelError as error:
+        pytest.skip(f"the profile {profile} cannot run: {error}")
+    taken = []
+    with made:
+        frames = made.run(cycled([frame.points for frame in contest.scans.street], FRAMES + 5))
+        benchmark.extra_info.update(kernel="frame with chain", on=profile)
+        benchmark.pedantic(lambda: taken.append(next(frames)), rounds=FRAMES, warmup_rounds=5)
+        frames.close()
+    taken = taken[-FRAMES:]
+    assert not any(frame.failed for frame in taken)
+    stages = ("perception.chain", "perception.filter", "perception.ground", "perception.cluster")
+    front = [
+        sum(frame.latency.stages[name].run_ms for name in stages if name in frame.latency.stages) for frame in taken
+    ]
+    note = f"filter, ground and clusters; median of {FRAMES} frames"
+    record_figure(benchmark, f"front stages, {profile}", np.median(front), "ms", note=note)
+    total = np.median([frame.latency.total_ms for frame in taken])
+    record_figure(benchmark, f"whole frame, {profile}, median", total, "ms", note=f"of {FRAMES} frames")

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import warploom as wl
 from warploom.kernels.chain import CHAIN_STAGES
+from warploom.kernels.cpu_graph import is_alone
 from warploom.kernels.pillar import pillarize
 from warploom.kernels.threads import set_thread_count, thread_count
 
@@ -235,6 +236,18 @@ def test_chains_of_several_threads_do_not_disturb_each_other(captured):
     for thread in threads:
         thread.join()
     assert not failures
+
+
+def test_by_default_it_records_on_a_cpu_only_where_no_other_thread_could_launch():
+    """A chain made beside the main thread, which may be launching kernels, does not."""
+    made = []
+    thread = threading.Thread(target=lambda: made.append(wl.KernelChain(config=SMALL, capacity=1000)))
+    thread.start()
+    thread.join()
+    assert made[0].captured is False
+    assert wl.KernelChain(config=SMALL, capacity=1000).captured is is_alone()
+    points = scene(800)
+    assert_same(made[0](points), step_by_step(points, SMALL))
 
 
 def test_arrays_of_other_kinds_and_layouts():
