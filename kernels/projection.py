@@ -17,8 +17,10 @@ import warp as wp
 
 from .camera import Camera, borrow_image, camera_model, image_point, is_in_image
 from .device import DEFAULT_DEVICE, resolve_device
+from .image_values import paint, paint_in_parts
 from .interop import Points, adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .threads import launch_parts, thread_count
 
 __all__ = ["Painted", "PointPainting", "PointProjection", "Projected", "paint_points", "project_points"]
 
@@ -27,6 +29,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _INFINITE_DEPTH = 0x7F800000  # the bits of infinity
 _METHODS = ("bilinear", "nearest")
+_LEAST_OF_PART = 16_384  # points for which a thread of their own is worth its while
 
 
 @wp.func
@@ -69,6 +72,82 @@ def _project(
     visible_out[i] = visible
 
 
+# In C++, where a compiler makes vector instructions of the loop; it computes what `image_point` and `is_in_image` do.
+@wp.func_native("""
+    const float* const r = (const float*)&camera.rotation;
+    const float tx = camera.translation[0], ty = camera.translation[1], tz = camera.translation[2];
+    const float fx = camera.focal[0], fy = camera.focal[1], cx = camera.centre[0], cy = camera.centre[1];
+    const float r0 = r[0], r1 = r[1], r2 = r[2], r3 = r[3], r4 = r[4], r5 = r[5], r6 = r[6], r7 = r[7], r8 = r[8];
+    const float skew = camera.skew, right = (float)width - 0.5f, bottom = (float)height - 0.5f;
+    float* const depths = depth.data;
+    float* const to = (float*)pixels.data;
+    unsigned char* const seen = (unsigned char*)visible.data;
+    const auto run = [&](const long long step) {
+        const float* const from = (const float*)xyz.data;
+        for (int i = first; i < last; ++i) {
+            const float px = from[i * step], py = from[i * step + 1], pz = from[i * step + 2];
+            const float z = r6 * px + r7 * py + r8 * pz + tz;
+            const float x = (r0 * px + r1 * py + r2 * pz + tx) / z;
+            const float y = (r3 * px + r4 * py + r5 * pz + ty) / z;
+            const float u = z > 0.0f ? fx * x + skew * y + cx : NAN;
+            const float v = z > 0.0f ? fy * y + cy : NAN;
+            to[2 * i] = u;
+            to[2 * i + 1] = v;
+            depths[i] = z;
+            seen[i] = (u >= -0.5f) & (v >= -0.5f) & (u < right) & (v < bottom);
+        }
+    };
+    if (xyz.strides[0] == 16) run(4);
+    else if (xyz.strides[0] == 12) run(3);
+    else run(xyz.strides[0] / 4);
+    return last;
+""")
+def _project_run(
+    xyz: wp.array(dtype=wp.vec3),
+    camera: Camera,
+    width: int,
+    height: int,
+    first: int,
+    last: int,
+    pixels: wp.array(dtype=wp.vec2),
+    depth: wp.array(dtype=wp.float32),
+    visible: wp.array(dtype=wp.bool),
+) -> int:
+    """Projects the points first … last − 1 onto a camera without distortion."""
+
+
+@wp.kernel
+def _project_in_parts(
+    part: int,
+    parts: int,
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    camera: Camera,
+    width: int,
+    height: int,
+    # out
+    pixels_out: wp.array(dtype=wp.vec2),
+    depth_out: wp.array(dtype=wp.float32),
+    visible_out: wp.array(dtype=wp.bool),
+):
+    """Pixel and depth of a share of the points; nothing hides anything."""
+    rows = xyz_in.shape[0]
+    share = (rows + parts - 1) / parts
+    end = wp.min((part + 1) * share, rows)
+    last = wp.min(end, count_in[0])
+    if camera.is_distorted == 0:
+        _project_run(xyz_in, camera, width, height, part * share, last, pixels_out, depth_out, visible_out)
+    else:
+        for i in range(part * share, last):
+            point = image_point(xyz_in[i], camera)
+            pixels_out[i] = wp.vec2(point[0], point[1])
+            depth_out[i] = point[2]
+            visible_out[i] = is_in_image(point, width, height)
+    for i in range(wp.max(part * share, last), end):
+        visible_out[i] = False
+
+
 @wp.kernel
 def _hide(
     # in
@@ -90,50 +169,13 @@ def _hide(
         visible[i] = depth_in[i] <= wp.cast(nearest_in[at[0], at[1]], wp.float32) + margin
 
 
-@wp.kernel
-def _paint(
-    # in
-    pixels_in: wp.array(dtype=wp.vec2),
-    visible_in: wp.array(dtype=wp.bool),
-    count_in: wp.array(dtype=wp.int32),
-    image_in: wp.array3d(dtype=Any),
-    bilinear: int,
-    # out
-    values_out: wp.array2d(dtype=wp.float32),
-):
-    """One point a thread: what the image says at its pixel; beyond the outermost centres, what it says there."""
-    i = wp.tid()
-    if i >= count_in[0]:
-        return
-    if not visible_in[i]:
-        for channel in range(values_out.shape[1]):
-            values_out[i, channel] = 0.0
-        return
-    height = image_in.shape[0]
-    width = image_in.shape[1]
-    pixel = pixels_in[i]
-    if bilinear == 0:
-        row = wp.min(int(pixel[1] + 0.5), height - 1)
-        column = wp.min(int(pixel[0] + 0.5), width - 1)
-        for channel in range(values_out.shape[1]):
-            values_out[i, channel] = float(image_in[row, column, channel])
-        return
-    u = wp.clamp(pixel[0], 0.0, float(width - 1))
-    v = wp.clamp(pixel[1], 0.0, float(height - 1))
-    left = int(u)
-    top = int(v)
-    right = wp.min(left + 1, width - 1)
-    bottom = wp.min(top + 1, height - 1)
-    a = u - float(left)
-    b = v - float(top)
-    for channel in range(values_out.shape[1]):
-        above = float(image_in[top, left, channel]) * (1.0 - a) + float(image_in[top, right, channel]) * a
-        below = float(image_in[bottom, left, channel]) * (1.0 - a) + float(image_in[bottom, right, channel]) * a
-        values_out[i, channel] = above * (1.0 - b) + below * b
+def _in_parts(device: str) -> bool:
+    """Whether few threads do much each, as suits a CPU, or many little."""
+    return resolve_device(device) == DEFAULT_DEVICE
 
 
-for _dtype in (wp.uint8, wp.float32):
-    wp.overload(_paint, {"image_in": wp.array3d(dtype=_dtype)})
+def _parts_for(points: int) -> int:
+    return max(1, min(thread_count(), points // _LEAST_OF_PART))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,6 +244,10 @@ class PointProjection:
     ) -> None:
         """Writes where the caller wants it."""
         cell = self.occlusion_cell
+        if not cell and _in_parts(self.device):
+            inputs = [xyz, count, camera, *self.image_size]
+            launch_parts(_project_in_parts, _parts_for(xyz.shape[0]), inputs, [pixels, depth, visible])
+            return
         if cell:
             self._nearest.fill_(_INFINITE_DEPTH)
         wp.launch(
@@ -260,13 +306,12 @@ class PointPainting:
         wanted = (*self.projection.image_size[::-1], self.channels)
         if tuple(image.shape) != wanted or image.dtype not in (wp.uint8, wp.float32):
             raise ValueError(f"image must be uint8 or float32 of shape {wanted}, not {image.dtype} of {image.shape}")
-        wp.launch(
-            _paint,
-            n,
-            inputs=[pixels, visible, count, image, int(self.method == "bilinear")],
-            outputs=[values],
-            device=self.projection.device,
-        )
+        inputs = [pixels, visible, count, image, int(self.method == "bilinear")]
+        device = self.projection.device
+        if _in_parts(device):
+            launch_parts(paint_in_parts, _parts_for(n), [*inputs, n], [values])
+        else:
+            wp.launch(paint, n, inputs=inputs, outputs=[values], device=device)
 
 
 @dataclass(frozen=True, eq=False)

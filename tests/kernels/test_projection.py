@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from warploom.kernels import projection
 from warploom.kernels.camera import camera_model
 from warploom.kernels.projection import PointPainting, PointProjection, paint_points, project_points
+from warploom.kernels.threads import set_thread_count, thread_count
 
 SIZE = (640, 480)
 K = np.array([[500.0, 0, 322.3], [0, 510.0, 238.8], [0, 0, 1]])
@@ -284,3 +286,41 @@ def test_wrong_images_are_refused():
         paint_points(points, np.zeros((5, 5), np.uint8), np.eye(4), K, method="cubic")
     with pytest.raises(TypeError, match="image must be a NumPy"):
         paint_points(points, [[1]], np.eye(4), K)
+
+
+@pytest.mark.parametrize("lens", [None, LENSES[2]])
+@pytest.mark.parametrize("columns", [3, 4, 5])
+@pytest.mark.parametrize("method", ["bilinear", "nearest"])
+def test_parts_and_many_threads_give_the_same_bytes(lens, columns, method, monkeypatch):
+    """Parts of a CPU, and the kernels of a GPU on a CPU."""
+    points = np.column_stack([cloud(120_000, 8), np.zeros(120_000, np.float32)])[:, :columns].copy()
+    odd = np.random.default_rng(9).random((120_000, 3)) < 0.003
+    points[:, :3][odd] = np.random.default_rng(10).choice(
+        np.float32([0, np.nan, np.inf, -np.inf, 1e-45, 3e38]), odd.sum()
+    )
+    image = np.random.default_rng(11).integers(0, 256, (*SIZE[::-1], 3)).astype(np.uint8)
+    before, found = thread_count(), set()
+    for parts in (1, 2, 3, 7, None):
+        if parts is None:
+            monkeypatch.setattr(projection, "_in_parts", lambda _: False)
+        try:
+            set_thread_count(parts or before)
+            seen = project_points(points, rig(), K, SIZE, distortion=lens)
+            painted = paint_points(points, image, rig(), K, distortion=lens, method=method)
+        finally:
+            set_thread_count(before)
+        # Which of the bits of NaN a processor gives is its own affair.
+        arrays = [np.nan_to_num(seen.pixels, nan=-1e9), np.nan_to_num(seen.depth, nan=-1e9), seen.visible]
+        found.add(b"".join(array.tobytes() for array in [*arrays, painted.values, painted.visible]))
+    assert len(found) == 1
+    assert seen.visible.sum() > 10_000
+
+
+def test_the_plan_hides_points_past_its_count_in_parts():
+    points = cloud(40_000, 12)
+    xyz = wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu")
+    plan = PointProjection(capacity=40_000, image_size=SIZE, device="cpu")
+    for n in (40_000, 25_000, 100, 0):
+        plan.launch(xyz, wp.array([n], dtype=wp.int32, device="cpu"), camera_model(rig(), K))
+        assert np.array_equal(plan.visible.numpy()[:n], project_points(points[:n], rig(), K, SIZE).visible)
+        assert not plan.visible.numpy()[n:].any()
