@@ -16,6 +16,7 @@ import warp as wp
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
+from .parts import first_row_of, part_start, parts_for, run_parts
 from .plan import capacity_for, plan_for
 
 __all__ = ["BevMaps", "bev"]
@@ -23,6 +24,7 @@ __all__ = ["BevMaps", "bev"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
+_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
 _HEIGHT, _INTENSITY, _DENSITY = (wp.constant(i) for i in range(3))
 _HIGHEST, _COUNT = (wp.constant(i) for i in range(2))  # the columns of a cell
 _LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))
@@ -37,6 +39,7 @@ class _Grid:
     cells_per_metre: wp.vec2
     rows: int
     columns: int
+    words: int  # of 32 cells in a row, the last one possibly not full
 
 
 @wp.func
@@ -53,58 +56,164 @@ def _cell_of(p: wp.vec3, grid: _Grid) -> int:
     return row * grid.columns + column
 
 
+@wp.func_native("""
+    const auto run = [&](const float* __restrict points, const long long step, int* __restrict cell) {
+        const float low[3] = {grid.low[0], grid.low[1], grid.low[2]};
+        const float high[3] = {grid.high[0], grid.high[1], grid.high[2]};
+        const float per_metre[2] = {grid.cells_per_metre[0], grid.cells_per_metre[1]};
+        const int last_row = grid.rows - 1, last_column = grid.columns - 1, width = 32 * grid.words;
+        for (long long i = first; i < last; ++i) {
+            const float x = points[i * step], y = points[i * step + 1], z = points[i * step + 2];
+            const bool inside = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+                & (z >= low[2]) & (z < high[2]);
+            const int u = (int)(inside ? (x - low[0]) * per_metre[0] : 0.0f);
+            const int v = (int)(inside ? (y - low[1]) * per_metre[1] : 0.0f);
+            const int row = u < last_row ? u : last_row, column = v < last_column ? v : last_column;
+            cell[i] = inside ? row * width + column : -1;
+        }
+    };
+    const float* points = (const float*)xyz_in.data;
+    if (xyz_in.strides[0] == 16) run(points, 4, cell_out.data);
+    else if (xyz_in.strides[0] == 12) run(points, 3, cell_out.data);
+    else run(points, xyz_in.strides[0] / 4, cell_out.data);
+""")
+def _find_cells(
+    xyz_in: wp.array(dtype=wp.vec3), grid: _Grid, first: int, last: int, cell_out: wp.array(dtype=wp.int32)
+):
+    """The cells of the points first … last − 1, −1 where there is none."""
+
+
 @wp.kernel
-def _draw_in_order(
+def _find_cells_of_part(
     # in
+    part: int,
+    parts: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    # out
+    cell_out: wp.array(dtype=wp.int32),
+):
+    """The cells of one part of the points, in rows of whole words of 32 cells."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    _find_cells(xyz_in, grid, part_start(n, part, parts), part_start(n, part + 1, parts), cell_out)
+
+
+@wp.func_native("""
+    constexpr int FULL = 63, AHEAD = 16;
+    const long long step = xyz_in.strides[0] / 4, step_intensity = intensity_in.strides[0] / 4;
+    const float* __restrict xyz = (const float*)xyz_in.data;
+    const float* __restrict intensity = intensity_in.data;
+    const int* __restrict cell_of_point = cell_in.data;
+    float* __restrict all_states = (float*)states.data;
+    unsigned* __restrict there = occupied.data;
+    const unsigned width = 32 * grid.words;
+    const unsigned begin = first_row * width, length = (last_row - first_row) * width;
+    for (int i = 0; i < points; ++i) {
+    #ifndef __CUDA_ARCH__
+        if (i + AHEAD < points && (unsigned)cell_of_point[i + AHEAD] - begin < length)
+            __builtin_prefetch(all_states + 4ll * cell_of_point[i + AHEAD], 1);
+    #endif
+        const int cell = cell_of_point[i];
+        if ((unsigned)cell - begin >= length) continue;
+        float* __restrict state = all_states + 4ll * cell;
+        const float z = xyz[step * i + 2], value = intensity ? intensity[step_intensity * i] : 0.0f;
+        const bool is_higher = (state[2] == 0.0f) | (z > state[0]);
+        state[0] = is_higher ? z : state[0];
+        state[1] = is_higher ? value : state[1];
+        state[2] = state[2] < (float)FULL ? state[2] + 1.0f : state[2];
+        there[cell >> 5] |= 1u << (cell & 31);
+    }
+""")
+def _raise_rows(
+    xyz_in: wp.array(dtype=wp.vec3),
+    intensity_in: wp.array(dtype=wp.float32),
+    points: int,
+    cell_in: wp.array(dtype=wp.int32),
+    grid: _Grid,
+    first_row: int,
+    last_row: int,
+    states: wp.array(dtype=wp.vec4),
+    occupied: wp.array(dtype=wp.uint32),
+):
+    """Height, intensity and count of the cells in the rows first_row … last_row − 1, of the points in order."""
+
+
+@wp.func_native("""
+    const auto lowest_bit = [](unsigned bits) {
+    #ifdef __CUDA_ARCH__
+        return __ffs(bits) - 1;
+    #else
+        return __builtin_ctz(bits);
+    #endif
+    };
+    const long long plane = (long long)grid.rows * grid.columns;
+    for (int row = first_row; row < last_row; ++row)
+        for (int in_row = 0; in_row < grid.words; ++in_row) {
+            const long long word = (long long)row * grid.words + in_row;
+            unsigned bits = occupied.data[word];
+            const unsigned changed = shown.data ? bits | shown.data[word] : ~0u;
+            if (!changed) continue;
+            if (shown.data) shown.data[word] = bits;
+            occupied.data[word] = 0;
+            float value[3][32] = {};
+            for (; bits; bits &= bits - 1) {
+                const int k = lowest_bit(bits);
+                float* __restrict state = (float*)(states.data + 32 * word + k);
+                value[0][k] = state[0];
+                value[1][k] = state[1];
+                value[2][k] = density_in.data[(int)state[2]];
+                state[2] = 0.0f;
+            }
+            float* __restrict to = maps.data + (long long)row * grid.columns + 32 * in_row;
+            const int length = grid.columns - 32 * in_row;
+            // By halves of a word, each a line of the cache.
+            for (int map = 0; map < 3; ++map, to += plane)
+                for (int half = 0; half < 32; half += 16) {
+                    if (!(changed >> half & 0xFFFF)) continue;
+                    if (length >= 32) for (int k = half; k < half + 16; ++k) to[k] = value[map][k];
+                    else for (int k = half; k < half + 16 && k < length; ++k) to[k] = value[map][k];
+                }
+        }
+""")
+def _draw_rows(
+    density_in: wp.array(dtype=wp.float32),
+    grid: _Grid,
+    first_row: int,
+    last_row: int,
+    states: wp.array(dtype=wp.vec4),
+    occupied: wp.array(dtype=wp.uint32),
+    shown: wp.array(dtype=wp.uint32),
+    maps: wp.array2d(dtype=wp.float32),
+):
+    """Draws rows, and empties their cells; all of a row, or where `shown` is not null, what has changed."""
+
+
+@wp.kernel
+def _draw_part(
+    # in
+    part: int,
+    parts: int,
     xyz_in: wp.array(dtype=wp.vec3),
     intensity_in: wp.array(dtype=wp.float32),
     count_in: wp.array(dtype=wp.int32),
-    grid: _Grid,
+    cell_in: wp.array(dtype=wp.int32),
     density_in: wp.array(dtype=wp.float32),
-    # in out: the density map as integers, zero, for now one and the place among those seen of each cell
-    place: wp.array(dtype=wp.int32),
-    # out: of each cell seen its number, and its height, intensity and count
-    seen: wp.array(dtype=wp.int32),
-    values: wp.array(dtype=wp.vec3),
-    # in out: zero
+    grid: _Grid,
+    # in out: of each cell its height, intensity and count, and a bit where there is one, zero and left so
+    states: wp.array(dtype=wp.vec4),
+    occupied: wp.array(dtype=wp.uint32),
+    # in out: a bit for each cell that the maps show, or null where they are new
+    shown: wp.array(dtype=wp.uint32),
     maps: wp.array2d(dtype=wp.float32),
 ):
-    """One thread: collects the cells that are seen side by side, and draws them in the end."""
-    cells_seen = int(0)
-    before = int(-1)
-    at = int(0)
-    value = wp.vec3(0.0, 0.0, 0.0)
-    for i in range(wp.min(count_in[0], xyz_in.shape[0])):
-        p = xyz_in[i]
-        cell = _cell_of(p, grid)
-        if cell >= 0:
-            # Neighbours in a scan are mostly neighbours in space: often it is the cell of the point before.
-            if cell != before:
-                if before >= 0:
-                    values[at] = value
-                before = cell
-                at = place[cell] - 1
-                if at < 0:
-                    at = cells_seen
-                    cells_seen += 1
-                    place[cell] = cells_seen
-                    seen[at] = cell
-                    value = wp.vec3(-wp.inf, 0.0, 0.0)
-                else:
-                    value = values[at]
-            value[2] = value[2] + 1.0
-            if p[2] > value[0]:
-                value[0] = p[2]
-                if intensity_in:
-                    value[1] = intensity_in[i]
-    if before >= 0:
-        values[at] = value
-    for k in range(cells_seen):
-        cell = seen[k]
-        value = values[k]
-        maps[_HEIGHT, cell] = value[0]
-        maps[_INTENSITY, cell] = value[1]
-        maps[_DENSITY, cell] = density_in[int(wp.min(value[2], float(_FULL)))]
+    """Draws one of the parts that the rows of the maps are cut into."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    width = 32 * grid.words
+    first = first_row_of(part, parts, cell_in, n, grid.rows, width)
+    last = first_row_of(part + 1, parts, cell_in, n, grid.rows, width)
+    _raise_rows(xyz_in, intensity_in, n, cell_in, grid, first, last, states, occupied)
+    _draw_rows(density_in, grid, first, last, states, occupied, shown, maps)
 
 
 @wp.kernel
@@ -179,7 +288,9 @@ class BevMaps:
     device: str = DEFAULT_DEVICE
     """A Warp device, such as `cpu` or `cuda:0`."""
     method: str = "auto"
-    """`in_order` (one thread), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
+    """`in_order` (in parts), `shared` (parallel), or `auto`: `in_order` on a CPU, else `shared`: equal results."""
+    parts: int | None = None
+    """How many parts of the maps are drawn at once, by `in_order`; by default as the threads are worth it."""
 
     maps: wp.array = field(init=False, repr=False)
     """Height [m], intensity and density per cell, shape (3, rows, columns), float32; zero where there is no point."""
@@ -197,16 +308,18 @@ class BevMaps:
         if len(self.shape) != 2 or min(self.shape) < 1:
             raise ValueError(f"shape must be rows and columns, at least 1 each, not {self.shape}")
         rows, columns = self.shape
-        if rows * columns > 2**31 - 1:
+        if rows * (columns + 31) // 32 * 32 > 2**31 - 1:
             raise ValueError(f"shape {self.shape} has more cells than 2³¹ − 1")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts must be at least 1, not {self.parts}")
         device = resolve_device(self.device)
         sequential = self.method == "in_order" or (self.method == "auto" and device == DEFAULT_DEVICE)
         grid = _Grid()
         grid.low, grid.high = wp.vec3(*low), wp.vec3(*high)
         grid.cells_per_metre = wp.vec2(rows / (high[0] - low[0]), columns / (high[1] - low[1]))
-        grid.rows, grid.columns = rows, columns
+        grid.rows, grid.columns, grid.words = rows, columns, (columns + 31) // 32
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
@@ -216,12 +329,14 @@ class BevMaps:
         density = np.log1p(np.arange(_FULL + 1)) / np.log(_FULL + 1)
         keep("_density", wp.array(density, dtype=wp.float32, device=device))
         if sequential:
-            most = min(self.capacity, rows * columns)
-            keep("_seen", wp.empty(most, dtype=wp.int32, device=device))
-            keep("_values", wp.empty(most, dtype=wp.vec3, device=device))
+            words = rows * grid.words
+            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            keep("_states", wp.zeros(32 * words, dtype=wp.vec4, device=device))
+            keep("_occupied", wp.zeros(words, dtype=wp.uint32, device=device))
+            keep("_shown", wp.zeros(words, dtype=wp.uint32, device=device))
         else:
             keep("_cells", wp.zeros((rows * columns, 2), dtype=wp.int64, device=device))
-            keep("_cell", wp.zeros(self.capacity, dtype=wp.int32, device=device))
+        keep("_cell", wp.zeros(self.capacity, dtype=wp.int32, device=device))
         keep("maps", wp.zeros((3, rows, columns), dtype=wp.float32, device=device))
         keep("_flat", self.maps.reshape((3, rows * columns)))
 
@@ -233,25 +348,13 @@ class BevMaps:
             intensity: Shape (n,), float32; None where there are none, which gives zeros.
             count: Shape (1,), int32.
         """
-        self.maps.zero_()
-        self._draw_into(self._flat, xyz, intensity, count)
-
-    def _draw_into(self, maps: wp.array, xyz: wp.array, intensity: wp.array | None, count: wp.array) -> None:
-        """Draws on maps that are zero, shape (3, cells)."""
         n = xyz.shape[0]
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         if self._sequential:
-            cells = maps.shape[1]
-            place = wp.array(ptr=maps.ptr + 8 * cells, dtype=wp.int32, shape=cells, device=self.device)
-            wp.launch(
-                _draw_in_order,
-                1,
-                inputs=[xyz, intensity, count, self._grid, self._density],
-                outputs=[place, self._seen, self._values, maps],
-                device=self.device,
-            )
+            self._draw_in_order(self._flat, xyz, intensity, count, self._shown)
             return
+        self.maps.zero_()
         wp.launch(
             _raise_cells,
             n,
@@ -262,8 +365,22 @@ class BevMaps:
         wp.launch(
             _draw_cells,
             n,
-            inputs=[xyz, intensity, count, self._cell, self._density, self._cells, maps],
+            inputs=[xyz, intensity, count, self._cell, self._density, self._cells, self._flat],
             device=self.device,
+        )
+
+    def _draw_in_order(
+        self, maps: wp.array, xyz: wp.array, intensity: wp.array | None, count: wp.array, shown: wp.array | None
+    ) -> None:
+        """Draws on maps of shape (3, cells): where they differ from what is `shown`, or everywhere."""
+        parts, device = self._parts, self.device
+        run_parts(_find_cells_of_part, parts, device, [xyz, count, self._grid], [self._cell])
+        run_parts(
+            _draw_part,
+            parts,
+            device,
+            [xyz, intensity, count, self._cell, self._density, self._grid],
+            [self._states, self._occupied, shown, maps],
         )
 
 
@@ -306,8 +423,8 @@ def bev(points: Any, point_range: Sequence[float], shape: Sequence[int], *, back
     if borrowed.device != DEFAULT_DEVICE:
         plan.launch(borrowed.xyz, borrowed.intensity, count)
         return give(plan.maps, borrowed.family)
-    # Straight onto an array of its own: zeros that are never written cost nothing.
-    host = np.zeros((3, *plan.shape), np.float32)
+    # Straight onto an array of its own: the maps are larger than the cloud.
+    host = np.empty((3, *plan.shape), np.float32)
     flat = wp.array(host.reshape(3, -1), dtype=wp.float32, copy=False, device=DEFAULT_DEVICE)
-    plan._draw_into(flat, borrowed.xyz, borrowed.intensity, count)
+    plan._draw_in_order(flat, borrowed.xyz, borrowed.intensity, count, None)
     return adopt(host, borrowed.family)

@@ -13,7 +13,7 @@ import warp as wp
 from .device import DEFAULT_DEVICE
 from .threads import launch_parts, thread_count
 
-__all__ = ["part_start", "parts_for", "run_parts"]
+__all__ = ["first_row_of", "part_start", "parts_for", "run_parts"]
 
 
 def parts_for(capacity: int, least: int) -> int:
@@ -25,6 +25,40 @@ def parts_for(capacity: int, least: int) -> int:
 def part_start(length: int, part: int, parts: int) -> int:
     """Where a part of `length` things begins; where the part after it begins, it ends."""
     return length / parts * part + wp.min(part, length % parts)
+
+
+@wp.func_native("""
+    constexpr int MOST = 512;
+    if (part == 0 || part == parts) return part == 0 ? 0 : rows;
+    const int step = count / MOST + 1;
+    int sample[MOST], samples = 0;
+    for (int i = 0; i < count; i += step) {
+        sample[samples] = cell_in.data[i];
+        samples += cell_in.data[i] >= 0;
+    }
+    const int wanted = (int)((long long)samples * part / parts);
+    int low = 0, high = rows;
+    while (low < high) {
+        const int middle = (low + high) / 2, end = (middle + 1) * width;
+        int below = 0;
+        for (int i = 0; i < samples; ++i) below += sample[i] < end;
+        if (below <= wanted) low = middle + 1;
+        else high = middle;
+    }
+    return low;
+""")
+def first_row_of(part: int, parts: int, cell_in: wp.array(dtype=wp.int32), count: int, rows: int, width: int) -> int:
+    """Where a part's rows of a grid begin, so that each part has about as many of a sample of the points.
+
+    Args:
+        part: The part, 0 … parts; where the part after it begins, it ends.
+        parts: How many.
+        cell_in: Of each point row × width + column, or −1 where it is in none.
+        count: How many points.
+        rows: Of the grid.
+        width: How many numbers a row takes.
+    """
+    return 0
 
 
 def run_parts(kernel: Any, parts: int, device: str, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:

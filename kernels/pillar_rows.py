@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from .device import DEFAULT_DEVICE  # noqa: F401  (starts Warp quietly)
-from .parts import part_start
+from .parts import first_row_of, part_start
 
 __all__ = ["PillarSpec", "describe_points", "draw_rows"]
 
@@ -101,12 +101,16 @@ def describe_points(
 
 
 @wp.func_native("""
-    constexpr int POINTS = 0, Z = 1, DX = 2, DY = 3, HIGH = 4, LOW = 5, BITS = 6, ROW = 8;
+    constexpr int POINTS = 0, Z = 1, DX = 2, DY = 3, HIGH = 4, LOW = 5, BITS = 6, ROW = 8, AHEAD = 16;
     const unsigned begin = (unsigned)first_row * 32 * spec.words;
     const unsigned length = (unsigned)(last_row - first_row) * 32 * spec.words;
     const int* __restrict place = place_in.data;
     long long* __restrict all_sums = sums.data;
     for (int i = 0; i < count; ++i) {
+    #ifndef __CUDA_ARCH__
+        if (i + AHEAD < count && (unsigned)place[i + AHEAD] - begin < length)
+            __builtin_prefetch(all_sums + ROW * (long long)place[i + AHEAD], 1);
+    #endif
         if ((unsigned)place[i] - begin >= length) continue;
         long long* __restrict cell = all_sums + ROW * (long long)place[i];
         const int z = above_in.data[i], offset = offset_in.data[i];
@@ -231,31 +235,6 @@ def _draw(
     """Draws rows, and empties their cells; all of a row, or where `shown` is not null, what has changed."""
 
 
-@wp.func_native("""
-    constexpr int MOST = 512;
-    if (part == 0 || part == parts) return part == 0 ? 0 : spec.rows;
-    const int step = count / MOST + 1;
-    int sample[MOST], samples = 0;
-    for (int i = 0; i < count; i += step) {
-        sample[samples] = place_in.data[i];
-        samples += place_in.data[i] >= 0;
-    }
-    const int wanted = (int)((long long)samples * part / parts);
-    int low = 0, high = spec.rows;
-    while (low < high) {
-        const int middle = (low + high) / 2, end = (middle + 1) * 32 * spec.words;
-        int below = 0;
-        for (int i = 0; i < samples; ++i) below += sample[i] < end;
-        if (below <= wanted) low = middle + 1;
-        else high = middle;
-    }
-    return low;
-""")
-def _first_row(part: int, parts: int, place_in: wp.array(dtype=wp.int32), count: int, spec: PillarSpec) -> int:
-    """Where a part's rows begin, so that each part has about as many of a sample of the points."""
-    return 0
-
-
 @wp.kernel
 def draw_rows(
     # in
@@ -276,7 +255,7 @@ def draw_rows(
 ):
     """Sums and draws one of the parts that the rows of the grid are cut into."""
     n = wp.min(count_in[0], points)
-    first_row = _first_row(part, parts, place_in, n, spec)
-    last_row = _first_row(part + 1, parts, place_in, n, spec)
+    first_row = first_row_of(part, parts, place_in, n, spec.rows, 32 * spec.words)
+    last_row = first_row_of(part + 1, parts, place_in, n, spec.rows, 32 * spec.words)
     _sum(place_in, offset_in, above_in, n, spec, first_row, last_row, sums, occupied)
     _draw(spec, spec.low[2], first_row, last_row, sums, occupied, shown, shown_slices, grid)

@@ -121,6 +121,42 @@ def test_both_methods_draw_any_floats_alike(rows):
     assert drawn[0] == drawn[1] == bev(points, RANGE, (8, 8)).tobytes()
 
 
+@pytest.mark.parametrize("columns", [1, 31, 32, 33, 100])
+def test_methods_and_parts_draw_the_same_bytes_scan_after_scan(columns):
+    ways = [{"method": "in_order", "parts": parts} for parts in (1, 2, 3, 7)] + [{"method": "shared"}]
+    plans = [BevMaps(capacity=4000, point_range=RANGE, shape=(70, columns), **way) for way in ways]
+    for seed, n in enumerate((4000, 3, 0, 3000)):
+        points = cloud(4000, seed, step=0.5)
+        xyz = wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu")
+        intensity = wp.array(points[:, 3].copy(), dtype=wp.float32, device="cpu")
+        count = wp.array([n], dtype=wp.int32, device="cpu")
+        for plan in plans:
+            plan.launch(xyz, intensity, count)
+        drawn = bev(points[:n], RANGE, (70, columns)).tobytes()
+        assert all(plan.maps.numpy().tobytes() == drawn for plan in plans)
+
+
+@pytest.mark.parametrize("kind", ["one cell", "on a line", "equal", "far", "backwards", "columns first"])
+def test_awkward_clouds(kind):
+    rng = np.random.default_rng(6)
+    points = cloud(3000, 6)
+    if kind == "one cell":
+        points[:, :2] = rng.uniform(0.1, 0.2, (3000, 2))
+    elif kind == "on a line":
+        points[:, 1] = points[:, 0] / 2
+    elif kind == "equal":
+        points[:] = points[1]
+    elif kind == "far":
+        points[::2, :3] += rng.choice([-1e5, 1e5], (1500, 3)).astype(np.float32)
+    made = {
+        "backwards": lambda: points[::-1].copy()[::-1],
+        "columns first": lambda: np.asfortranarray(points),
+    }.get(kind, lambda: points)()
+    maps, expected = bev(made, RANGE, (60, 50)), reference(points, RANGE, (60, 50))
+    assert np.array_equal(maps[:2], expected[:2])
+    np.testing.assert_allclose(maps[2], expected[2], atol=1e-6)
+
+
 def test_strided_read_only_and_float64_input_gives_the_same():
     points = np.random.default_rng(5).normal(0, [20, 20, 1.5, 1, 1, 1], (900, 6)).astype(np.float32)
     expected = bev(points[:, :4].copy(), RANGE, (30, 20))
@@ -149,6 +185,8 @@ def test_a_captured_launch_replays_on_other_points(device, method):
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="method must be 'auto', 'in_order' or 'shared', not 'fast'"):
         BevMaps(capacity=1, point_range=RANGE, shape=(1, 1), method="fast")
+    with pytest.raises(ValueError, match="parts must be at least 1, not 0"):
+        BevMaps(capacity=1, point_range=RANGE, shape=(1, 1), parts=0)
 
 
 @pytest.mark.parametrize(
