@@ -239,11 +239,19 @@ class DataProcessComponent(Component):
         running = self._running
         if running is not None:
             self._hangs({"process": running.version})
+            self._drop_waiting()
 
     def _hangs(self, where: Mapping[str, int]) -> None:
         for part, version in where.items():
             _log.error("%s: %s hangs at version %d since the stop, and is left to itself", self.name, part, version)
             self.losses.count(self.name, "hung", version)
+
+    def _drop_waiting(self) -> None:
+        """Settles what waits behind something that hangs."""
+        while self._backlog is not None and (trigger := self._backlog.take_now()) is not None:
+            if not trigger.settled:
+                self.losses.count(self.name, "shutdown", trigger.version)
+            self.settle(trigger.version, trigger.epoch)
 
     def _serve(self) -> None:
         assert self._backlog is not None
@@ -289,7 +297,7 @@ class DagComponent(DataProcessComponent):
         self._engine: GraphEngine | None = None
         self._vertices: Sequence[Vertex] = ()
         self._deadline: DeadlineConfig | None = None
-        self._closed = False
+        self._closed = self._stopping = False
         self._submitting = threading.Lock()
         self._free = 1
         self._slots = threading.Lock()
@@ -331,7 +339,8 @@ class DagComponent(DataProcessComponent):
         except BaseException:
             self._engine.stop()
             raise
-        self._closed = False
+        self._closed = self._stopping = False
+        self._free = self.in_flight
         super().start()
 
     def _start_serving(self) -> None:
@@ -342,28 +351,25 @@ class DagComponent(DataProcessComponent):
         assert self._engine is not None
         assert self._backlog is not None
         backlog = self._backlog
+        self._stopping = True
         self._advance()
         with self._idle:
             finished = self._idle.wait_for(
-                lambda: self._free == self.in_flight and not len(backlog), self.stop_timeout_s
+                lambda: self._free == self.in_flight and not len(backlog) and not self._submitting.locked(),
+                self.stop_timeout_s,
             )
         hanging = {} if finished else self._engine.running()
-        if self._engine.stop(None if finished else 0.1):
-            hanging = {}
-        self._hangs(hanging)
-        while (trigger := backlog.take_now()) is not None:  # behind one that hangs
-            self.losses.count(self.name, "shutdown", trigger.version)
-            self.settle(trigger.version, trigger.epoch)
+        ended = self._engine.stop(None if finished else 0.1)
+        if not finished:
+            self._hangs(hanging)
+            self._drop_waiting()
         for vertex in self._vertices:
-            if vertex.name not in hanging:
-                self._close(vertex)
+            if ended or vertex.name not in hanging:
+                try:
+                    vertex.processor.close()
+                except Exception:
+                    _log.exception("%s.%s failed to close", self.name, vertex.name)
         self._closed = True
-
-    def _close(self, vertex: Vertex) -> None:
-        try:
-            vertex.processor.close()
-        except Exception:
-            _log.exception("%s.%s failed to close", self.name, vertex.name)
 
     def _is_busy(self) -> bool:
         return self._free == 0 or bool(self._backlog)
@@ -382,16 +388,21 @@ class DagComponent(DataProcessComponent):
                 # While no slot is free, triggers wait in the backlog, where its policy rules.
                 trigger = self._backlog.take_now() if self._free > 0 else None
                 if trigger is None:
-                    return
-                if trigger.settled:
-                    self.settle(trigger.version, trigger.epoch)
-                else:
+                    break
+                try:
                     self._submit(trigger, serves)
+                except Exception:
+                    _log.exception("%s could not start at version %d", self.name, trigger.version)
+                    self.losses.count(self.name, "failed", trigger.version)
+                    self.settle(trigger.version, trigger.epoch)
+        if self._stopping:
+            with self._idle:
+                self._idle.notify_all()
 
     def _submit(self, trigger: Trigger, serves: bool) -> None:
         """Starts the graph for a trigger, or settles it. Called by one thread at a time."""
         assert self._engine is not None
-        data = self._data(trigger)
+        data = None if trigger.settled else self._data(trigger)
         if data is None:
             self.settle(trigger.version, trigger.epoch)
             return
@@ -425,9 +436,8 @@ class DagComponent(DataProcessComponent):
         try:
             self.settle(trigger.version, trigger.epoch)
         finally:
-            with self._idle:
+            with self._slots:
                 self._free += 1
-                self._idle.notify_all()
             self._submit_waiting(serves=True)
 
 
@@ -442,9 +452,10 @@ class MonotonicDagComponent(DagComponent):
 
     def _submit(self, trigger: Trigger, serves: bool) -> None:
         order = (trigger.epoch, trigger.version)
-        if order <= self._last_started:
-            self.losses.count(self.name, "out_of_order", trigger.version)
-            self.settle(trigger.version, trigger.epoch)
-            return
-        self._last_started = order
+        if not trigger.settled:
+            if order <= self._last_started:
+                self.losses.count(self.name, "out_of_order", trigger.version)
+                self.settle(trigger.version, trigger.epoch)
+                return
+            self._last_started = order
         super()._submit(trigger, serves)

@@ -148,6 +148,8 @@ class GraphEngine:
         hanging = self.running()
         if hanging:
             raise RuntimeError(f"{self.name} cannot start again: {hanging} still runs since the last stop")
+        for vertex in self._vertices:
+            vertex.queue.clear()
         self._stopping = False
         for number in range(self._worker_count):
             thread = threading.Thread(target=self._work, name=f"{self.name}-worker-{number}", daemon=True)
@@ -176,7 +178,6 @@ class GraphEngine:
         self._threads.clear()
         if finished:
             for vertex in self._vertices:
-                vertex.queue.clear()
                 vertex.running = None
         return finished
 
@@ -245,7 +246,7 @@ class GraphEngine:
         """Runs what is ready, in the calling thread, until nothing is."""
         while True:
             with self._lock:
-                if not self._ready:
+                if not self._ready or self._stopping:
                     return
                 vertex, run, resumed = self._ready.popleft()
             if not self._execute(vertex, run, resumed):
@@ -253,6 +254,8 @@ class GraphEngine:
             now = time.perf_counter_ns()
             with self._lock:
                 vertex.running = None
+                if self._stopping:  # it hung, and nobody waits for its frame any more
+                    return
                 run.remaining -= 1
                 done = run.remaining == 0
                 ready = 0

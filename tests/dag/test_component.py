@@ -50,11 +50,11 @@ def doubler(
     return component
 
 
-def joining(mesh, trigger):
+def joining(mesh, trigger, backlog=FIFO, hand_off="thread", prefix=""):
     """A graph that joins the two inputs that trigger it."""
     component = DagComponent("join")
     component.add_handles(["left", "right"], ["output"])
-    component.bind(mesh, {"left": "left", "right": "right", "output": "output"})
+    component.bind(mesh, {name: f"{prefix} {name}".strip() for name in ("left", "right", "output")})
     join, commit = JoinOptional(), CommitDagProcessor()
     commit.component_outputs = component.outputs
     commit.init(CommitDagProcessor.Config(output="output"))
@@ -63,7 +63,7 @@ def joining(mesh, trigger):
         Vertex("commit", commit, {"value": "joined"}, {}),
     ]
     component.set_graph(vertices, workers=1, in_flight=1)
-    component.set_trigger(trigger, FIFO)
+    component.set_trigger(trigger, backlog, hand_off)
     return component
 
 
@@ -713,6 +713,91 @@ def test_what_hangs_at_the_stop_is_named_counted_and_left_to_itself(topic, caplo
     hold.release(1)
     for worker in workers:
         worker.join(WAIT)
+
+
+@pytest.mark.parametrize("last", ["settled", "out of order", "evicted"])
+def test_a_stop_does_not_wait_for_what_does_not_run(last, topic, monkeypatch):
+    """What waits behind the last frame is settled, and the stop comes back when that is done."""
+    monkeypatch.setattr(DagComponent, "stop_timeout_s", 3600.0)
+    mesh = DataMesh(window_capacity=1 if last == "evicted" else 8)
+    hold = Holding(10)
+    given, result = topic(mesh.window("input")), topic(mesh.window("output", 8))
+    component = dag(mesh, hold, kind=MonotonicDagComponent)
+    component.start()
+    given.commit(10)
+    hold.wait_until_held(10)
+    if last == "settled":
+        given.settle(20)
+    elif last == "out of order":
+        given.commit(5, policy=CommitPolicy.OVERWRITE)
+    else:
+        given.commit(20)
+        given.commit(30)
+        given.commit(40)
+    stopper = threading.Thread(target=component.stop, daemon=True)
+    stopper.start()
+    hold.release(10)
+    stopper.join(WAIT)
+    assert not stopper.is_alive()
+    expected = {"settled": {10, 20}, "out of order": {5, 10}, "evicted": {10, 20, 30, 40}}[last]
+    assert set(result.events) == expected
+
+
+def test_a_frame_that_cannot_start_is_counted_and_settled_and_the_next_runs(topic, started, caplog):
+    """The device failed while it wrote what triggered."""
+
+    class Broken:
+        stream = None
+
+        def synchronize(self):
+            raise OSError("device lost")
+
+    mesh = DataMesh()
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    started(dag(mesh, same))
+    given.window.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, Entry(1, "a", 0, 0, completion=Broken()))
+    given.commit(2, "b")
+    result.wait_for(1, 2)
+    assert result.entries == {2: "b"}
+    assert mesh.losses.as_dict() == {"dag": {"failed": 1}}
+    assert "device lost" in caplog.text
+
+
+def test_what_hung_at_a_stop_and_came_back_does_not_go_on_and_the_component_starts_again(topic, monkeypatch):
+    monkeypatch.setattr(DagComponent, "stop_timeout_s", 0.05)
+    mesh, after = DataMesh(), []
+    hold = Holding(1)
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = dag(mesh, hold, lambda trigger, value: after.append(trigger.version))
+    component.start()
+    given.commit(1)
+    hold.wait_until_held(1)
+    workers = list(component._engine._threads)
+    component.stop()
+    hold.release(1)
+    for worker in workers:
+        worker.join(WAIT)
+    assert after == []
+    component.start()
+    given.commit(2)
+    result.wait_for(2)
+    component.stop()
+    assert after == [2]
+
+
+def test_all_inline_and_blocking_takes_several_versions_that_one_commit_completes(topic, started):
+    """The backlog has room for one, and the thread that completes three runs them itself."""
+    mesh = DataMesh()
+    for hand_off in ("inline", "thread"):
+        component = joining(mesh, {"all": ["left", "right"], "tolerance_ms": 5e-6}, BLOCK, hand_off, hand_off)
+        started(component)
+        left, right, result = (topic(mesh.window(f"{hand_off} {name}")) for name in ("left", "right", "output"))
+        for version in (10, 12, 14):
+            left.commit(version, version)
+        assert result.events == []
+        right.commit(13, "r")
+        result.wait_for(10, 12, 14)
+        assert result.entries == {10: (10, "r"), 12: (12, "r"), 14: (14, "r")}
 
 
 def test_a_data_process_that_hangs_at_the_stop_is_left_to_itself(topic, monkeypatch):
