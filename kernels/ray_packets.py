@@ -21,6 +21,7 @@ _BLOCK = wp.constant(256)  # rays of a part's turn; near ones meet the same face
 _TRAVERSAL = """
     using namespace wp;
     constexpr int WIDTH = 8;
+    constexpr int DEEPEST = 128;  // of a tree; they are as deep as the logarithm of their faces, or somewhat more
     struct Packet {
         float o[3][WIDTH], d[3][WIDTH], r[3][WIDTH], length;
         void prepare() {
@@ -60,8 +61,8 @@ _TRAVERSAL = """
     };
     const auto descend = [&](const BVH& bvh, const Packet& p, const float* best, const auto& leaf) {
         constexpr int never = 0x7f7fffff;
-        uint64_t stack[BVH_QUERY_STACK_SIZE];
-        int entries[BVH_QUERY_STACK_SIZE], depth = 0;
+        uint64_t stack[DEEPEST];
+        int entries[DEEPEST], depth = 0;
         const int root = *bvh.root;
         if (entry(p, best, bvh_load_node(bvh.node_lowers, root), bvh_load_node(bvh.node_uppers, root)) == never) return;
         uint64_t node = bvh_query_node_load(bvh, root);
@@ -82,7 +83,7 @@ _TRAVERSAL = """
                     const bool left_first = to_left <= to_right;
                     node = left_first ? left_node : right_node;
                     const int later = left_first ? to_right : to_left;
-                    if (later != never && depth < BVH_QUERY_STACK_SIZE) {
+                    if (later != never && depth < DEEPEST) {
                         stack[depth] = left_first ? right_node : left_node;
                         entries[depth++] = later;
                     }
