@@ -125,8 +125,8 @@ class KernelChain:
     captured: bool | None = None
     """Whether the launches are recorded once and replayed: as one CUDA graph, or as Warp's graphs for a CPU.
 
-    None: yes on a GPU; on a CPU where no other thread of the process is alive. While a chain is made that records on a
-    CPU, no other thread may launch kernels there, for Warp would record them too. A recorded frame costs Python next to
+    None: yes on a GPU; on a CPU where no other thread of the process is alive. While a chain is made that records, no
+    other thread may launch kernels on its device, for Warp would record them too. A recorded frame costs Python next to
     nothing, a direct one some 30 µs for each launch."""
 
     points: wp.array = field(init=False, repr=False, compare=False)
