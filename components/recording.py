@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ..dag import Process
 from ..dag.replay import Drain, Replay, ReplayResult, produced_topics
+from ..dag.run_log import RunLog
 from ..datamesh import DataMesh
 from ..datamesh.playback import Player
 from ..datamesh.recording import RecordedEvent, Recorder
@@ -87,6 +88,14 @@ def recorder_for(
     )
 
 
+def _record(recorder: Recorder, process: Process, pipeline: Pipeline, topics: Iterable[str]) -> None:
+    """Records topics of a process that has not started, and the log of its run."""
+    recorder.watch(process.mesh, topics)
+    log = RunLog(recorder.log)
+    log.watch(process)
+    pipeline.on_timing(log.on_timing)
+
+
 def all_topics(process: Process) -> list[str]:
     """The topics that the components of a process read or write."""
     read = {handle.topic for component in process.components.values() for handle in component.inputs.values()}
@@ -158,7 +167,7 @@ def record_source(
                 compression=compression,
             )
             stack.push(recorder)
-            recorder.watch(process.mesh, chosen)
+            _record(recorder, process, pipeline, chosen)
 
         perceived = pipeline.run(itertools.islice(source, frames), realtime=realtime, watch=watch)
         stack.callback(perceived.close)
@@ -235,6 +244,8 @@ def replay_lines(workers: int | None, result: ReplayResult, changed: Sequence[st
         lines.append(f"  … and {result.different - _SHOWN} more")
     if result.broken:
         lines.append(f"  the recording was read up to its break: {result.broken}")
+    if result.hung:
+        lines.append(f"  the replay hung: {result.hung}")
     if result.good:
         lines.append(f"  bit-exact: all {result.equal.total()} commits have the recorded hashes")
     else:
@@ -312,7 +323,10 @@ def play_recording(
                 recorder_for(pipeline, record, source=str(path), settings=settings) if pipeline else Recorder(record)
             )
             stack.push(recorder)
-            recorder.watch(mesh, {*played, *(all_topics(process) if process is not None else ())})
+            if process is not None and pipeline is not None:
+                _record(recorder, process, pipeline, {*played, *all_topics(process)})
+            else:
+                recorder.watch(mesh, played)
         player = Player(
             recording,
             mesh,

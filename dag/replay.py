@@ -12,18 +12,19 @@ from typing import NamedTuple
 from ..datamesh import Entry
 from ..datamesh.messages import encode
 from ..datamesh.playback import Player
-from ..datamesh.recording import EventKind, digest
+from ..datamesh.recording import EventKind, RecordedEvent, digest
 from ..datamesh.recording_reader import Recording
 from ..errors import ConfigError
 from .component import DataProcessComponent
 from .configuration import nearest
 from .process import Process
+from .run_log import RecordedRuns
 from .triggering import AllTrigger
 
 __all__ = ["Difference", "Replay", "ReplayResult", "produced_topics"]
 
 _SHOWN = 100
-_DRAIN = 120.0  # [s]: a frame that takes longer than this has hung
+_DRAIN = 60.0  # [s]: a frame that takes longer than this has hung
 
 
 class Difference(NamedTuple):
@@ -53,6 +54,9 @@ class ReplayResult:
     broken: str | None = None
     """Where the recording broke off."""
 
+    hung: str | None = None
+    """Which frame did not get through, so that the replay ended there."""
+
     @property
     def good(self) -> bool:
         """Whether every commit was compared, and is what was recorded."""
@@ -81,10 +85,13 @@ class Replay:
         self._process = process
         produced = produced_topics(process)
         made: list[tuple[str, int, int, bytes]] = []
+        logged: list[RecordedEvent] = []
         sources: dict[str, tuple[int, bool]] = {}
         for event in recording:
             if event.kind is EventKind.COMMIT and event.topic in produced:
                 made.append((event.topic, event.epoch, event.version, event.sha256))
+            elif event.kind is EventKind.LOG:
+                logged.append(event)
             elif event.kind is EventKind.COMMIT:
                 sources.setdefault(event.topic, (event.epoch, event.payload is not None))
         needed = {
@@ -104,6 +111,9 @@ class Replay:
         self._expected: dict[str, dict[tuple[int, int], list[bytes]]] = defaultdict(lambda: defaultdict(list))
         for topic, epoch, version, sha256 in made:
             self._expected[topic][epoch - first, version].append(sha256)
+        self._runs = RecordedRuns()
+        for event in logged:
+            self._runs.add(event, first)
         self._result = ReplayResult()
         self._lock = threading.Lock()
 
@@ -117,10 +127,22 @@ class Replay:
         for topic in self._expected:
             mesh.window(topic).subscribe(partial(self._compare, topic), lambda *_: None)
         drain = Drain(self._process, self._sources)
-        player = Player(self._recording, mesh, self._sources, rate=None, before_epoch=drain.wait)
+        if self._runs:
+            self._runs.apply(self._process)
+        player = Player(
+            self._recording,
+            mesh,
+            self._sources,
+            rate=None,
+            before_epoch=drain.wait,
+            on_log=lambda event: self._runs.on_played(event, self._process),
+        )
         self._process.start()
         try:
             player.play()
+            drain.wait()
+        except TimeoutError as error:
+            self._result.hung = str(error)
         finally:
             self._process.stop()
         result = self._result

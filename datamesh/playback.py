@@ -38,6 +38,7 @@ class Player:
         loops: int | None = 1,
         before_epoch: Callable[[], None] = lambda: None,
         on_event: Callable[[RecordedEvent], bool] = lambda event: True,
+        on_log: Callable[[RecordedEvent], None] = lambda event: None,
     ) -> None:
         """Prepares, without publishing anything.
 
@@ -50,6 +51,7 @@ class Player:
             loops: How often to play it; None: until `stop`.
             before_epoch: Called before each new epoch.
             on_event: Called before each event is published; False ends the playing, so a caller can step.
+            on_log: Called for each entry of a log beside the data, in its place among the events.
 
         Raises:
             ValueError: A number makes no sense.
@@ -67,6 +69,7 @@ class Player:
         self._loops = loops
         self._before_epoch = before_epoch
         self._on_event = on_event
+        self._on_log = on_log
         self._stopping = threading.Event()
         self._epoch = 0
         self._outputs: dict[str, Output] = {}
@@ -103,7 +106,9 @@ class Player:
         start = 0.0
         newest: dict[str, tuple[int, int]] = {}
         for event in self._recording:
-            if event.topic not in self._outputs or event.kind is EventKind.LOSS:
+            if event.kind is EventKind.LOG:
+                self._on_log(event)
+            if event.topic not in self._outputs or event.kind in (EventKind.LOSS, EventKind.LOG):
                 continue
             if base is None:
                 base, beginning = event.epoch, event.version

@@ -31,7 +31,7 @@ from .mesh import DataMesh
 from .messages import decode, encode, message_type
 from .snapshot import Entry
 
-__all__ = ["ENCODING", "HEADER", "LOSSES", "EventKind", "RecordedEvent", "Recorder", "digest"]
+__all__ = ["ENCODING", "HEADER", "LOSSES", "READS", "RUNS", "EventKind", "RecordedEvent", "Recorder", "digest"]
 
 ENCODING = "warploom"
 """Of channels and of messages."""
@@ -39,6 +39,10 @@ HEADER = struct.Struct("<B7xQqq32s")
 """Kind, epoch, received_ns, committed_ns, SHA-256 of the payload."""
 LOSSES = "warploom/losses"
 """The topic of what was lost: a tuple of place and reason."""
+RUNS = "warploom/runs"
+"""The topic of triggers that components took: the component, and the versions that triggered, by input."""
+READS = "warploom/reads"
+"""The topic of what sync vertices read: the vertex, and epoch and version by input; None where it was left out."""
 
 _QUEUE = 64  # commits that may wait for the writer; they hold the payloads, which are in the windows anyway
 
@@ -52,6 +56,8 @@ class EventKind(IntEnum):
     SETTLE = 1
     """There will be nothing at this version."""
     LOSS = 2
+    LOG = 3
+    """An entry of a log beside the data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +214,10 @@ class Recorder:
         mesh.losses.on_loss(self._on_loss)
         for topic in topics:
             mesh.window(topic).subscribe(partial(self._on_commit, topic), partial(self._on_settle, topic))
+
+    def log(self, topic: str, epoch: int, version: int, value: Any) -> None:
+        """Adds an entry to a log beside the data; `value` is of what `datamesh.messages` encodes."""
+        self._offer(_Event(topic, EventKind.LOG, epoch, version, 0, self._clock.monotonic_ns(), value))
 
     def _on_commit(self, topic: str, entry: Entry) -> None:
         stamps = entry.received_ns, entry.committed_ns

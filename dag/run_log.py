@@ -1,0 +1,250 @@
+"""The log of a run: what the clock decided in it, so that a replay need not ask a clock.
+
+Which triggers each component took, with the versions that triggered (what a backlog dropped is not among them); what
+weak and strong sync read, and so which waits ended without data; and which vertices a deadline left out. All of it is
+in a recording beside the data.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+from ..datamesh import Miss, Status
+from ..datamesh.recording import READS, RUNS, RecordedEvent
+from .backlog import Backlog, BacklogConfig
+from .component import DagComponent, DataProcessComponent
+from .engine import VertexTiming
+from .process import Process
+from .processor import Processor
+from .trigger import Trigger
+from .triggering import TriggerSource
+
+__all__ = ["RecordedRuns", "RunLog"]
+
+_Order = tuple[int, int]
+Log = Callable[[str, int, int, object], None]
+
+
+class _Backlog:
+    """A backlog with something before or behind it."""
+
+    def __init__(self, inner: Backlog) -> None:
+        self._inner = inner
+
+    def __len__(self) -> int:
+        return len(self._inner)
+
+    def offer(self, trigger: Trigger) -> Trigger | None:
+        return self._inner.offer(trigger)
+
+    def take(self) -> Trigger | None:
+        return self._inner.take()
+
+    def take_now(self) -> Trigger | None:
+        return self._inner.take_now()
+
+    def open(self) -> None:
+        self._inner.open()
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+class _Logged(_Backlog):
+    """Tells which triggers the component takes."""
+
+    def __init__(self, inner: Backlog, on_taken: Callable[[Trigger], None]) -> None:
+        super().__init__(inner)
+        self._on_taken = on_taken
+
+    def take(self) -> Trigger | None:
+        return self._told(super().take())
+
+    def take_now(self) -> Trigger | None:
+        return self._told(super().take_now())
+
+    def _told(self, trigger: Trigger | None) -> Trigger | None:
+        if trigger is not None and not trigger.settled:
+            self._on_taken(trigger)
+        return trigger
+
+
+class RunLog:
+    """Writes the log of a run: `log(topic, epoch, version, value)` is called for each entry, from any thread."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+
+    def watch(self, process: Process) -> None:
+        """Logs what the components of a process take, which has not started."""
+        for component in process.components.values():
+            if isinstance(component, DataProcessComponent) and component._backlog is not None:
+                component._backlog = _Logged(component._backlog, partial(self._on_taken, component.name))  # type: ignore[assignment]
+
+    def _on_taken(self, component: str, trigger: Trigger) -> None:
+        self._log(RUNS, trigger.epoch, trigger.version, (component, dict(trigger.inputs)))
+
+    def on_timing(self, timing: VertexTiming) -> None:
+        """Logs what a vertex read, and that it was left out."""
+        if timing.reads or timing.status is Status.CUT:
+            reads = None if timing.status is Status.CUT else {name: tuple(read) for name, read in timing.reads.items()}
+            self._log(READS, timing.epoch, timing.version, (f"{timing.component}.{timing.vertex}", reads))
+
+
+@dataclass
+class _Taken:
+    """The triggers that a component took, in their order."""
+
+    runs: list[tuple[int, int, dict[str, int]]] = field(default_factory=list)
+    """Epoch, version, and the versions that triggered, by input."""
+    given: int = 0
+    released: int = 0
+    """Those without inputs, which time triggered, are given when the replay gets to where they were taken."""
+    lock: threading.RLock = field(default_factory=threading.RLock)
+
+
+class RecordedRuns:
+    """What the log of a recorded run says; makes a process repeat it."""
+
+    def __init__(self) -> None:
+        self._taken: dict[str, _Taken] = defaultdict(_Taken)
+        self._reads: dict[str, dict[_Order, Mapping[str, _Order] | None]] = defaultdict(dict)
+
+    def add(self, event: RecordedEvent, first: int) -> None:
+        """Takes up an entry.
+
+        Args:
+            event: Of the topics `RUNS` and `READS`; others are left.
+            first: The first epoch of the recording, which is the epoch 0 of the replay.
+
+        Raises:
+            ValueError: It is damaged.
+        """
+        if event.topic not in (RUNS, READS):
+            return
+        order = (event.epoch - first, event.version)
+        place, what = event.value
+        if event.topic == RUNS:
+            self._taken[place].runs.append((*order, what))
+        elif what is None:
+            self._reads[place][order] = None
+        else:
+            self._reads[place][order] = {name: (epoch - first, version) for name, (epoch, version) in what.items()}
+
+    def __bool__(self) -> bool:
+        return bool(self._taken)
+
+    def apply(self, process: Process) -> None:
+        """Makes a process that has not started take the triggers of the log, and read what it says."""
+        for component in process.components.values():
+            taken = self._taken.get(component.name)
+            if not isinstance(component, DataProcessComponent) or taken is None or component._backlog is None:
+                continue
+            # It blocks, also where ticks of time would replace each other: nothing of the log may be lost.
+            backlog = Backlog(component.name, BacklogConfig(policy="block"), component.losses)
+            component._backlog = _Replayed(backlog, taken.runs)  # type: ignore[assignment]
+            if not component.trigger_inputs:
+                component._source = TriggerSource()  # no ticks of a clock
+            for name in component.trigger_inputs:
+                give = partial(self._on_event, component)
+                component.inputs[name].window.subscribe(give, give)
+        for component in process.components.values():
+            for vertex in component._vertices if isinstance(component, DagComponent) else ():
+                place = f"{component.name}.{vertex.name}"
+                vertex.processor.recorded_reads = partial(self._read, place)
+                if None in self._reads[place].values():
+                    vertex.processor = _LeftOut(vertex.processor, self._reads[place])
+
+    def _read(self, place: str, trigger: Trigger) -> Mapping[str, _Order]:
+        return self._reads[place].get((trigger.epoch, trigger.version)) or {}
+
+    def on_played(self, event: RecordedEvent, process: Process) -> None:
+        """Gives the triggers of time that were taken here."""
+        if event.topic != RUNS:
+            return
+        name, inputs = event.value
+        component = process.components.get(name)
+        if not inputs and isinstance(component, DataProcessComponent):
+            self._taken[name].released += 1
+            self._give(component)
+
+    def _on_event(self, component: DataProcessComponent, *_: object) -> None:
+        self._give(component)
+
+    def _give(self, component: DataProcessComponent) -> None:
+        """Gives a component the next triggers of the log, as far as what triggered is there."""
+        taken = self._taken[component.name]
+        with taken.lock:
+            while taken.given < len(taken.runs):
+                epoch, version, inputs = taken.runs[taken.given]
+                received = self._received(component, epoch, inputs)
+                if received is None or (not inputs and taken.given >= taken.released):
+                    return
+                taken.given += 1
+                if received < 0:
+                    component.losses.count(component.name, "not replayed", version)
+                    component.settle(version, epoch)
+                    continue
+                now = component.clock.monotonic_ns()
+                trigger = Trigger(version, received or now, False, epoch, now, inputs)
+                assert isinstance(component._backlog, _Replayed)
+                component._backlog.give(trigger)
+                component._advance()
+
+    @staticmethod
+    def _received(component: DataProcessComponent, epoch: int, inputs: Mapping[str, int]) -> int | None:
+        """When what triggered was received; None where it is not there yet, negative where it is gone."""
+        received = 0
+        for name, version in inputs.items():
+            snapshot = component.inputs[name].window.snapshot(epoch)
+            index = snapshot.version_index(version) if snapshot.epoch == epoch else -1
+            if index < 0:
+                gone = (Miss.EVICTED, Miss.SETTLED_EMPTY)
+                return -1 if snapshot.epoch == epoch and snapshot.miss(version) in gone else None
+            received = received or snapshot.entry(index).received_ns
+        return received
+
+
+class _Replayed(_Backlog):
+    """Takes the triggers of the log, and none that the mesh makes; those that the run did not take are given back."""
+
+    def __init__(self, inner: Backlog, runs: Iterable[tuple[int, int, Mapping[str, int]]]) -> None:
+        super().__init__(inner)
+        self._wanted = {(epoch, version) for epoch, version, _ in runs}
+
+    def offer(self, trigger: Trigger) -> Trigger | None:
+        if trigger.settled:
+            return super().offer(trigger)
+        return None if (trigger.epoch, trigger.version) in self._wanted else trigger
+
+    def give(self, trigger: Trigger) -> None:
+        """Takes a trigger of the log."""
+        super().offer(trigger)
+
+
+class _LeftOut(Processor):
+    """A vertex that the recorded run left out in some frames."""
+
+    def __init__(self, inner: Processor, reads: Mapping[_Order, object]) -> None:
+        self.__dict__.update(inner.__dict__)
+        self._inner = inner
+        self._left_out = {order for order, read in reads.items() if read is None}
+        self.waits = inner.waits  # type: ignore[misc]
+
+    def init(self, config) -> None:
+        self._inner.init(config)
+
+    def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
+        return (trigger.epoch, trigger.version) not in self._left_out and self._inner.begin(trigger, resume)
+
+    def process(self, trigger: Trigger) -> Status:
+        if (trigger.epoch, trigger.version) in self._left_out:
+            return Status.CUT
+        return self._inner.process(trigger)
+
+    def close(self) -> None:
+        self._inner.close()

@@ -1,0 +1,234 @@
+"""A run at its own pace, in which the clock decides much, replays to the bit, because its log says what was decided."""
+
+import random
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from warploom.dag import In, Out, Process, Processor, Status, load_module
+from warploom.dag.replay import Replay, produced_topics
+from warploom.dag.run_log import RunLog
+from warploom.datamesh import CommitPolicy, Output
+from warploom.datamesh.recording import READS, RUNS, Recorder
+from warploom.datamesh.recording_reader import Recording
+
+pytestmark = pytest.mark.usefixtures("no_thread_left")
+COMMIT = "{{processor: warploom.dag.CommitDagProcessor, in: {{value: {0}}}, config: {{output: {0}}}}}"
+
+
+class SlowSum(Processor):
+    """Keeps a sum, and now and then takes longer than the next frame; slower than in a replay."""
+
+    value: In[int]
+    extra: In[object] = In(optional=True)
+    total: Out[object]
+    slow = True
+
+    def init(self, config):
+        self.sum = 0.0
+
+    def process(self, trigger):
+        if self.slow:
+            time.sleep(random.Random(trigger.version).choice((0.0, 0.001, 0.008)))
+        self.sum = self.sum * 0.5 + self.value.value
+        if self.extra.present:
+            extra = self.extra.value
+            known = extra if isinstance(extra, int) else sum(extra.values.values()) + 1000 * len(extra.absent)
+            self.sum += known
+        self.total.value = (trigger.version, self.sum)
+        return Status.OK
+
+
+def module(vertices: str, *, trigger: str = "value", more: str = "", inputs: str = "value: sensor/value") -> str:
+    return f"""\
+module: test
+components:
+  - name: sums
+    kind: dag
+    trigger: {trigger}
+    inputs: {{{inputs}}}
+    outputs: {{total: made/total}}
+    backlog: {{policy: latest}}
+    workers: 2
+    in_flight: 2
+{more}    graph:
+{vertices}      commit: {COMMIT.format("total")}
+"""
+
+
+SUM = f"      sum: {{processor: {__name__}.SlowSum}}\n"
+OUTSIDE = {"sensor/value": int, "sensor/map": int}
+
+
+def feed(mesh, topic, versions, pause=0.0):
+    output = Output()
+    output.bind(topic, mesh.window(topic))
+    for version in versions:
+        with output.allocate_change() as change:
+            change.set_version(version)
+            change.value = version % 17
+            output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+        if pause:
+            time.sleep(random.uniform(0, 2 * pause))
+
+
+def record(write, tmp_path, text, run):
+    """A run at its own pace with its log."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        log = RunLog(recorder.log)
+        process = Process([load_module(write(text))], external=OUTSIDE, on_timing=log.on_timing)
+        recorder.watch(process.mesh, {*OUTSIDE, *produced_topics(process)})
+        log.watch(process)
+        process.start()
+        run(process.mesh)
+        process.stop()
+    assert not recorder.dropped
+    return Recording(tmp_path / "a.mcap"), process.mesh.losses.as_dict()
+
+
+def replay(write, text, recording, workers, monkeypatch):
+    monkeypatch.setattr(SlowSum, "slow", False)
+    changes = {("sums", "workers"): workers, ("sums", "in_flight"): workers}
+    process = Process([load_module(write(text), changes)], external=OUTSIDE, offline=True)
+    return Replay(recording, process).run()
+
+
+def check(write, tmp_path, text, run, monkeypatch, commits=20):
+    recording, losses = record(write, tmp_path, text, run)
+    for workers in (1, 2, 8):
+        result = replay(write, text, recording, workers, monkeypatch)
+        assert result.good, (workers, result.differences, result.hung)
+        assert result.equal["made/total"] >= commits
+    return recording, losses
+
+
+def test_triggers_that_a_backlog_dropped_are_not_run_in_the_replay(write, tmp_path, monkeypatch):
+    recording, losses = check(
+        write, tmp_path, module(SUM), lambda mesh: feed(mesh, "sensor/value", range(300), 0.001), monkeypatch
+    )
+    assert losses["sums"]["backlog"] > 20
+    taken = [event.version for event in recording if event.topic == RUNS]
+    assert len(taken) == 300 - losses["sums"]["backlog"]
+    # Without the log they would all be run, and the sums be others.
+    monkeypatch.setattr("warploom.dag.replay.RecordedRuns.__bool__", lambda self: False)
+    assert not replay(write, module(SUM), recording, 2, monkeypatch).good
+
+
+RECENT = (
+    "      recent: {processor: warploom.dag.GetRecentDagProcessor, out: {value: extra}, config: {input: map}}\n"
+    f"      sum: {{processor: {__name__}.SlowSum}}\n"
+)
+BOTH = "value: sensor/value, map: sensor/map"
+
+
+def feed_both(mesh):
+    threads = [
+        threading.Thread(target=feed, args=(mesh, "sensor/value", range(100, 300), 0.002)),
+        threading.Thread(target=feed, args=(mesh, "sensor/map", range(100, 300, 3), 0.009)),
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def test_weak_sync_reads_what_the_recorded_run_read(write, tmp_path, monkeypatch):
+    recording, _ = check(write, tmp_path, module(RECENT, inputs=BOTH), feed_both, monkeypatch)
+    reads = [(event.version, event.value[1]["map"][1]) for event in recording if event.topic == READS]
+    ages = [version - read for version, read in reads]
+    assert min(ages) >= 0
+    assert len(set(ages)) > 3, "which of the maps was there was a matter of luck"
+
+
+ALIGN = (
+    "      align: {processor: warploom.dag.AlignDagProcessor, out: {aligned: extra}, "
+    "config: {inputs: [map], timeout_ms: 4}}\n"
+    f"      sum: {{processor: {__name__}.SlowSum}}\n"
+)
+
+
+def test_strong_sync_ends_its_waits_as_in_the_recorded_run(write, tmp_path, monkeypatch):
+    recording, losses = check(write, tmp_path, module(ALIGN, inputs=BOTH), feed_both, monkeypatch)
+    assert sum(losses["sums.align"].values()) > 5, "some waits ended without data"
+    assert len([event for event in recording if event.topic == READS]) > 5, "and some with"
+
+
+def test_ticks_of_time_come_from_the_log(write, tmp_path, monkeypatch):
+    vertices = (
+        "      recent: {processor: warploom.dag.GetRecentDagProcessor, out: {value: newest}, config: {input: value}}\n"
+        f"      sum: {{processor: {__name__}.SlowSum, in: {{value: newest}}}}\n"
+    )
+    text = module(vertices, trigger="{period_ms: 3}")
+
+    def run(mesh):
+        start = time.time_ns()
+        feed(mesh, "sensor/value", [start + i * 1000 for i in range(100)], 0.002)
+
+    recording, _ = check(write, tmp_path, text, run, monkeypatch, commits=5)
+    assert all(event.value[1] == {} for event in recording if event.topic == RUNS)
+
+
+def test_what_a_deadline_left_out_is_left_out_again(write, tmp_path, monkeypatch):
+    vertices = (
+        f"      wait: {{processor: {__name__}.SlowSum, in: {{extra: nothing}}, out: {{total: slow}}}}\n"
+        f"      extra: {{processor: {__name__}.Extra, in: {{value: slow}}, expendable: true}}\n"
+        f"      sum: {{processor: {__name__}.SlowSum}}\n"
+    )
+    text = module(vertices, more="    deadline: {ms: 4, on_miss: degrade}\n")
+    recording, _ = check(write, tmp_path, text, lambda mesh: feed(mesh, "sensor/value", range(200), 0.003), monkeypatch)
+    left_out = [event.version for event in recording if event.topic == READS and event.value[1] is None]
+    assert 3 < len(left_out) < 190
+
+
+class Extra(Processor):
+    value: In[object]
+    extra: Out[object]
+
+    def process(self, trigger):
+        self.extra.value = trigger.version % 5
+        return Status.OK
+
+
+def test_a_component_that_gives_nothing_in_the_replay_holds_up_nobody(write, tmp_path, monkeypatch, caplog):
+    """The second waits for what the first committed in the recorded run, and does not now."""
+    text = (
+        module(SUM)
+        + f"""\
+  - name: second
+    kind: monotonic_dag
+    trigger: value
+    inputs: {{value: made/total}}
+    outputs: {{spread: made/second}}
+    graph:
+      spread: {{processor: {__name__}.Last}}
+      commit: {COMMIT.format("spread")}
+"""
+    )
+    recording, _ = record(write, tmp_path, text, lambda mesh: feed(mesh, "sensor/value", range(30), 0.004))
+    process_of_first = SlowSum.process
+
+    def fails(self, trigger):
+        if trigger.version == 20:
+            raise RuntimeError("only now")
+        return process_of_first(self, trigger)
+
+    monkeypatch.setattr(SlowSum, "process", fails)
+    result = replay(write, text, recording, 2, monkeypatch)
+    taken = {event.version for event in recording if event.topic == RUNS}
+    if 20 in taken:
+        assert not result.good
+        assert {(d.topic, d.version) for d in result.differences if d.what == "missing"} == {
+            ("made/total", 20), ("made/second", 20)
+        }  # fmt: skip
+    assert result.hung is None
+
+
+class Last(Processor):
+    value: In[object]
+    spread: Out[object]
+
+    def process(self, trigger):
+        self.spread.value = np.float32(self.value.value[1])
+        return Status.OK
