@@ -37,12 +37,12 @@ def bench_ground_f1(benchmark, scans, name):
     benchmark.extra_info.update(kernel="ground, F1", on=name)
     ours, theirs = benchmark.pedantic(score, rounds=1)
     record_score(
-        benchmark, "ground, mean F1", on=name, ours=ours.mean(), theirs=theirs.mean(), peer="pypatchworkpp",
-        unit="%", gain=GAIN.get(name, 0.0), note=f"{len(labelled)} scans",
+        benchmark, "F1 of the ground, mean", on=name, ours=ours.mean(), theirs=theirs.mean(), peer="pypatchworkpp",
+        unit="%", gain=GAIN.get(name, 0.0), note=f"{len(labelled)} scans; vegetation and what has no label is not scored",
     )  # fmt: skip
     worst = int(np.argmin(ours - theirs))
     record_score(
-        benchmark, "ground, the scan where ours does worst beside it, F1", on=name, ours=ours[worst],
+        benchmark, "F1 of the ground, worst scan beside the peer's", on=name, ours=ours[worst],
         theirs=theirs[worst], peer="pypatchworkpp", unit="%", gain=-SLACK, note=labelled[worst].name,
     )  # fmt: skip
 
