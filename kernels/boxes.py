@@ -33,7 +33,7 @@ from .threads import launch_parts, thread_count
 __all__ = ["FitBoxes", "fit_boxes"]
 
 _METHODS = ("l_shape", "min_area")
-_LEAST_OF_PART = 2048  # points for which a thread of their own is worth its while
+_LEAST_OF_PART = 8192  # points for which a thread of their own is worth its while
 _NON_FINITE, _TOO_MANY = (wp.constant(i) for i in range(2))
 
 

@@ -25,7 +25,8 @@ __all__ = ["GeneralizedIou", "RotatedIou", "giou_3d", "iou_3d", "rotated_iou_bev
 wp.set_module_options({"fuse_fp": False})
 
 _ENCLOSINGS = ("hull", "box")
-_PAIRS_OF_PART = 10_000  # pairs for which a thread of their own is worth its while
+# Pairs for which a thread of their own is worth its while.
+_PAIRS_OF_PART, _GENERALISED_OF_PART = 100_000, 5_000
 _A, _B, _Z, _H, _VOLUME = (wp.constant(row) for row in (2, 3, 6, 7, 9))
 
 
@@ -212,11 +213,18 @@ class _Pairs:
             wp.launch(shape_boxes, given.shape[0], inputs=[given, None], outputs=[shapes], device=self.shapes.device)
 
     def launch(
-        self, rows: wp.Kernel, matrix: wp.Kernel, inputs: list, outputs: list, pairs: tuple[int, int], of_rows: list
+        self,
+        rows: wp.Kernel,
+        matrix: wp.Kernel,
+        inputs: list,
+        outputs: list,
+        pairs: tuple[int, int],
+        of_rows: list,
+        of_part: int,
     ) -> None:
         """Launches the kernel for rows on a CPU, in parts and with inputs of its own, else that for pairs."""
         if self.shapes.device.is_cpu:
-            parts = max(1, min(self.parts, pairs[0] * pairs[1] // _PAIRS_OF_PART))
+            parts = max(1, min(self.parts, pairs[0] * pairs[1] // of_part))
             launch_parts(rows, parts, [*inputs, *of_rows, self.near], outputs)
         else:
             wp.launch(matrix, pairs, inputs=inputs, outputs=outputs, device=self.shapes.device)
@@ -297,7 +305,7 @@ def _find_overlaps(
     n, m = boxes.shape[0], others.shape[0]
     pairs.shape(boxes, others)
     inputs = [pairs.shapes, pairs.other_shapes, counts]
-    pairs.launch(_iou_rows, _iou_matrix, inputs, outputs, (n, m), [n, m, is_clear])
+    pairs.launch(_iou_rows, _iou_matrix, inputs, outputs, (n, m), [n, m, is_clear], _PAIRS_OF_PART)
 
 
 def _find_generalised(
@@ -306,7 +314,7 @@ def _find_generalised(
     n, m = boxes.shape[0], others.shape[0]
     pairs.shape(boxes, others)
     inputs = [pairs.shapes, pairs.other_shapes, counts, enclosing == "box"]
-    pairs.launch(_giou_rows, _giou_matrix, inputs, outputs, (n, m), [n, m])
+    pairs.launch(_giou_rows, _giou_matrix, inputs, outputs, (n, m), [n, m], _GENERALISED_OF_PART)
 
 
 @lru_cache(maxsize=64)

@@ -24,7 +24,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _LAST = wp.constant(3.0e38)
 _A, _B = (wp.constant(row) for row in (2, 3))
-_PAIRS_OF_PART = 20_000  # pairs for which a thread of their own is worth its while
+_PAIRS_OF_PART = 200_000  # pairs for which a thread of their own is worth its while
 
 
 @wp.kernel

@@ -116,10 +116,11 @@ def test_wrong_arguments_are_refused():
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
-def test_parts_and_all_pairs_give_the_same_bits(parts):
+def test_parts_and_all_pairs_give_the_same_bits(parts, monkeypatch):
     """A CPU looks only at boxes that are near, in parts; a GPU at all."""
     boxes, scores = crowded(np.random.default_rng(12), 500)
     boxes[::50, 3], boxes[7::60, 0], boxes[11::70, 6] = 0.0, np.nan, np.inf
+    monkeypatch.setattr(nms, "_PAIRS_OF_PART", 1)
     before = thread_count()
     try:
         set_thread_count(parts)
