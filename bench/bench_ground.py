@@ -38,7 +38,7 @@ def bench_ground_f1(benchmark, scans, name):
     ours, theirs = benchmark.pedantic(score, rounds=1)
     record_score(
         benchmark, "F1 of the ground, mean", on=name, ours=ours.mean(), theirs=theirs.mean(), peer="pypatchworkpp",
-        unit="%", gain=GAIN.get(name, 0.0), note=f"{len(labelled)} scans; vegetation and what has no label is not scored",
+        unit="%", gain=GAIN.get(name, 0.0), note=f"{len(labelled)} scans; vegetation and the unlabelled not scored",
     )  # fmt: skip
     worst = int(np.argmin(ours - theirs))
     record_score(
