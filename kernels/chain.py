@@ -113,7 +113,7 @@ class KernelChain:
     kernel of the caller's may write `points` and `count`.
 
     The results are to the bit those of the stages' own functions, called one after the other; captured or not, and on
-    any number of threads.
+    any number of threads. A chain serves one frame at a time.
     """
 
     config: ChainConfig = ChainConfig()

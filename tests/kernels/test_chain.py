@@ -1,5 +1,6 @@
 """The chain against its steps, called one by one through their own functions: equal to the bit, frame after frame."""
 
+import functools
 import re
 import threading
 
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warploom as wl
+from warploom.kernels import chain as chain_module
 from warploom.kernels.chain import CHAIN_STAGES
 from warploom.kernels.cpu_graph import is_alone
 from warploom.kernels.pillar import pillarize
@@ -119,6 +121,24 @@ def test_equals_its_steps_frame_after_frame(frames, captured):
         assert_same(result, step_by_step(points, EVERY_STAGE))
         assert not result.overflow
         assert result.cluster_count == len(result.boxes) == result.labels.max() + 1 > 5
+
+
+def test_the_way_of_work_for_gpus_gives_the_same(monkeypatch, captured):
+    """All plans as they work on a GPU, whose counts decide nothing on the host either."""
+    ways = {
+        "PointFilter": "scan",
+        "GroundSegment": "shared",
+        "EuclideanCluster": "shared",
+        "Voxelize": "sort",
+        "PillarGrid": "shared",
+        "BevMaps": "shared",
+    }
+    for name, method in ways.items():
+        monkeypatch.setattr(chain_module, name, functools.partial(getattr(chain_module, name), method=method))
+    chain = wl.KernelChain(config=SMALL, capacity=4096, captured=captured)
+    for seed, n in enumerate((4000, 10, 0, 4096, 1, 2500)):
+        points = scene(n, seed)
+        assert_same(chain(points), step_by_step(points, SMALL))
 
 
 def test_clouds_may_grow_shrink_and_be_empty(captured):
@@ -321,6 +341,49 @@ def test_the_examples_of_the_docs_run(repository, tmp_path, monkeypatch, frames,
     exec(compile(code, "kernels.md", "exec"), names)
     assert np.array_equal(names["found"].labels, wl.KernelChain(config=wl.ChainConfig(radius=0.6))(frames[0]).labels)
     assert capsys.readouterr().out
+
+
+def test_lanes_on_streams_begin_after_the_fork_and_end_before_the_join(monkeypatch):
+    """On streams that only take notes: what a GPU is told, in order."""
+    told = []
+
+    class Stream:
+        def __init__(self, name):
+            self.name = name
+
+        def record_event(self, event):
+            told.append((self.name, "records", event))
+
+        def wait_event(self, event):
+            told.append((self.name, "waits for", event))
+
+    class Scoped:
+        def __init__(self, stream, sync_enter):
+            assert not sync_enter  # which would be a wait that the graph does not need
+            self.stream = stream
+
+        def __enter__(self):
+            told.append((self.stream.name, "is entered"))
+
+        def __exit__(self, *_):
+            told.append((self.stream.name, "is left"))
+
+    chain = wl.KernelChain(config=SMALL, capacity=1000, captured=False)
+    monkeypatch.setattr(chain_module.wp, "get_stream", lambda device: Stream("main"))
+    monkeypatch.setattr(chain_module.wp, "ScopedStream", Scoped)
+    object.__setattr__(chain, "_forked", "fork")
+    object.__setattr__(chain, "_side", [(Stream("side"), "side done"), (Stream("unused"), "never")])
+    chain._run_on_streams([lambda: told.append("first lane"), lambda: told.append("second lane")])
+    assert told == [
+        ("main", "records", "fork"),
+        ("side", "waits for", "fork"),
+        ("side", "is entered"),
+        "second lane",
+        ("side", "is left"),
+        ("side", "records", "side done"),
+        "first lane",
+        ("main", "waits for", "side done"),
+    ]
 
 
 @pytest.mark.cuda
