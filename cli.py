@@ -110,6 +110,9 @@ def run(
     mcap: Annotated[bool, typer.Option(help="Write run.mcap.")] = True,
     trace: TraceFile = None,
     metrics_port: MetricsPort = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Look whether data are written to after their commit, and count them.")
+    ] = False,
 ) -> None:
     """Perceive the frames of a recording or of the simulator.
 
@@ -121,7 +124,7 @@ def run(
         source,
         profile=profile,
         device=device,
-        settings=settings or (),
+        settings=[*(settings or ()), *(["profile.check=true"] if check else [])],
         out=out,
         frames=frames,
         realtime=realtime,

@@ -196,6 +196,7 @@ class Pipeline:
             external={LIDAR_TOPIC: SensorFrame},
             offline=offline,
             on_timing=self._record,
+            check=self.profile.check,
         )
 
     def _record(self, timing: VertexTiming) -> None:

@@ -66,6 +66,8 @@ class Profile(_Spec):
     """Module files, by name or path."""
     settings: dict[str, Any] = {}
     """Changes to the modules, by dotted key: `component.vertex.key`."""
+    check: bool = False
+    """Whether payloads are compared with what they were at their commit; reads every byte, for tests."""
 
 
 def load_profile(name: str, changes: Mapping[tuple[str, ...], Any] | None = None) -> ConfigFile[Profile]:

@@ -429,6 +429,9 @@ class DagComponent(DataProcessComponent):
 
     def _done(self, run: Run) -> None:
         trigger = run.trigger
+        for name, version in trigger.inputs.items():
+            if self.inputs[name].window.check:
+                self.inputs[name].window.verify_version(version, trigger.epoch)
         if run.deadline is not None and run.deadline.end():
             self.losses.count(self.name, "deadline", trigger.version)
         if run.error is not None:

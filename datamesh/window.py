@@ -380,6 +380,13 @@ class Window(Generic[T]):
         for after in self._after:
             after()
 
+    def verify_version(self, version: int, epoch: int) -> None:
+        """Does what `verify` does with the datum of a version, if it is there."""
+        snapshot = self.snapshot(epoch)
+        index = snapshot.version_index(version)
+        if index >= 0:
+            self.verify(snapshot.entry(index))
+
     def verify(self, entry: Entry[T]) -> None:
         """Counts a datum, once, whose payload is not what it was at its commit: somebody wrote to it."""
         if entry.checksum is None or checksum(entry.value) == entry.checksum:

@@ -128,6 +128,27 @@ def test_a_processor_that_raises_costs_its_own_output_in_one_frame(street, caplo
     assert "made to fail" in caplog.text
 
 
+class Scribbles(FailsOnce):
+    """Stands in for the head, and writes to the sensor's points, which NumPy's flag alone cannot prevent."""
+
+    def process(self, trigger):
+        sensor = self.filtered.value.sensor
+        if sensor.index == 1:
+            sensor.points.setflags(write=True)
+            sensor.points[0, 0] += 1.0
+            sensor.points.setflags(write=False)
+        self.foreground.value = Detections.empty()
+        return Status.OK
+
+
+def test_a_profile_that_checks_counts_who_writes_to_data_after_their_commit(street):
+    settings = {"perception.graph.detect.processor": f"{__name__}.Scribbles", "profile.check": True}
+    with wl.Pipeline.from_profile("cpu", settings=settings) as pipeline:
+        frames = [cloud_frame(f.index, f.points.copy()) for f in street[:3]]
+        assert len(list(pipeline.run(frames))) == 3
+        assert pipeline.losses["lidar/points"] == {"modified": 1}
+
+
 def test_a_source_that_fails_raises_after_the_frames_before_it(pipeline, street):
     def breaking():
         yield from street[:3]
