@@ -137,7 +137,7 @@ def _sample_three_bytes(
     const auto pixels_at = [&](const long long at) {
         const long long held = at < bytes - 8 ? at : bytes - 8;
         Wide pair;
-        __builtin_memcpy(&pair, image + held, 8);
+        memcpy(&pair, image + held, 8);
         return pair >> 8 * (at - held);
     };
     for (int start = first; start < last; start += BLOCK) {
@@ -152,8 +152,8 @@ def _sample_three_bytes(
             colour[k] = (unsigned int)((total >> 13 & 0xff) | (total >> 26 & 0xff00) | (total >> 39 & 0xff0000));
         }
         unsigned char* to = ground + 3LL * start;
-        for (int k = 0; k + 1 < length; ++k, to += 3) __builtin_memcpy(to, colour + k, 4);
-        __builtin_memcpy(to, colour + length - 1, 3);
+        for (int k = 0; k + 1 < length; ++k, to += 3) memcpy(to, colour + k, 4);
+        memcpy(to, colour + length - 1, 3);
     }
     return last;
 """)
