@@ -242,8 +242,8 @@ def _sort_wide(
             used += 1
             low[0] = wp.min(low[0], cells[i][0])
             high = wp.max(high, cells[i])
-    for pass_ in range(3):
-        axis = 2 - pass_
+    axis = int(2)
+    while axis >= 0:
         extent = wp.uint32(high[axis]) - wp.uint32(low[axis])
         shift = int(0)
         while shift < 32 and (extent >> wp.uint32(shift)) > wp.uint32(0):
@@ -265,6 +265,7 @@ def _sort_wide(
                 order[count[digit]] = spare[k][1]
                 count[digit] = count[digit] + 1
             shift += _WIDE_BITS
+        axis -= 1
     return used
 
 

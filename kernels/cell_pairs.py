@@ -207,7 +207,8 @@ def _touch_large(
     b_high = wp.vec3(infinite)
     a_left = a_end - a_begin
     b_left = b_end - b_begin
-    for _ in range(8):
+    turn = int(0)
+    while turn < 8:
         low = wp.vec3(infinite)
         high = wp.vec3(-infinite)
         left = int(0)
@@ -236,8 +237,9 @@ def _touch_large(
         b_left = left
         if a_left == 0 or b_left == 0:
             return False
-        if not narrowed and _ > 0:
-            break
+        turn += 1
+        if not narrowed and turn > 1:
+            turn = 8
     for i in range(a_begin, a_end):
         p = points[i]
         if _gap_squared(p, b_low, b_high) <= radius.surely_not:

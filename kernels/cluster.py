@@ -18,7 +18,8 @@ from .backend import uses_taichi
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
-from .cluster_columns import JoinedColumns, join_levels_in_order, label_points
+from .cluster_columns import JoinedColumns, label_points
+from .cluster_levels import join_levels_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for

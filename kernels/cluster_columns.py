@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns, Layout, aligned, is_before, row_of
-from .cell_pairs import Radius, find, hash_cell, join_levels, touch
+from .cell_pairs import Radius, find, touch
 from .device import DEFAULT_DEVICE
 from .unchecked import at, put
 
-__all__ = ["JoinedColumns", "join_levels_in_order", "label_points"]
+__all__ = ["JoinedColumns", "label_points"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -124,14 +124,14 @@ def _join_rows(
             other = k + 1
         while other < others_end and at(columns, other)[0] == x and at(columns, other)[1] <= here[1] + most_dy:
             there = at(columns, other)
-            if which == _ADJACENT:
-                _join_heights(here, there, 0, 0, stacks, points, radius, parent)
-                _join_heights(here, there, 1, 1, stacks, points, radius, parent)
-            elif at(column_root, k) < 0 or at(column_root, k) != at(column_root, other):
+            if which != _OTHERS or column_root[k] < 0 or column_root[k] != column_root[other]:
                 least = int(0)
-                if which == _OTHERS and dx < 2 and wp.abs(there[1] - here[1]) < 2:
+                most = int(2)
+                if which == _ADJACENT:
+                    most = 1
+                elif which == _OTHERS and dx < 2 and wp.abs(there[1] - here[1]) < 2:
                     least = 2
-                _join_heights(here, there, least, 2, stacks, points, radius, parent)
+                _join_heights(here, there, least, most, stacks, points, radius, parent)
             other += 1
 
 
@@ -438,51 +438,12 @@ def join_borders(
                 first = int(last)
                 while first > ranges[p][2] and not is_before(at(columns, first - 1), x, y):
                     first -= 1
-                for dx in range(3):
+                dx = int(0)
+                while dx < 3:
                     _join_rows(
                         columns, first, last, begin, end, dx, -2, 2, _ALL, column_root, stacks, points, radius, parent
                     )
-
-
-@wp.kernel
-def join_levels_in_order(
-    # in
-    ranges: wp.array(dtype=wp.vec4i),
-    columns: wp.array(dtype=wp.vec4i),
-    stacks: wp.array(dtype=wp.vec2i),
-    points: wp.array(dtype=wp.vec3),
-    no_slots: wp.array(dtype=wp.int32),
-    radius: Radius,
-    # in out: a table of cells, -1 where free, and left so; components
-    table: wp.array(dtype=wp.int32),
-    parent: wp.array(dtype=wp.int32),
-    # out
-    cells: wp.array(dtype=wp.vec3i),
-    slots: wp.array(dtype=wp.int32),
-    cell_begin: wp.array(dtype=wp.int32),
-    cell_end: wp.array(dtype=wp.int32),
-):
-    """Unites cells of different levels that touch."""
-    mask = table.shape[0] - 1
-    for p in range(ranges.shape[0]):
-        for k in range(ranges[p][2], ranges[p][3]):
-            column = at(columns, k)
-            for c in range(column[2], column[3]):
-                cell = wp.vec3i(column[0], column[1], at(stacks, c)[0])
-                slot = hash_cell(cell) & mask
-                while table[slot] >= 0:
-                    slot = (slot + 1) & mask
-                table[slot] = c
-                slots[c] = slot
-                cells[c] = cell
-                cell_begin[c] = at(stacks, c)[1]
-                cell_end[c] = at(stacks, c + 1)[1]
-    for p in range(ranges.shape[0]):
-        for c in range(ranges[p][0], ranges[p][1]):
-            join_levels(c, table, no_slots, cells, cell_begin, cell_end, points, radius, parent)
-    for p in range(ranges.shape[0]):
-        for c in range(ranges[p][0], ranges[p][1]):
-            table[slots[c]] = -1
+                    dx += 1
 
 
 @wp.kernel
