@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import pathlib
+from collections import Counter
 
 import numpy as np
 
+from ...datamesh.recording import EventKind
+from ...datamesh.recording_reader import Recording
 from ...errors import SourceError
 from ..messages import SensorFrame
 from .kitti import KittiSource
@@ -119,6 +122,9 @@ def _describe_mcap(path: pathlib.Path) -> dict[str, object]:
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
+    broken = _describe_broken(path)
+    if broken is not None:
+        return broken
     try:
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
@@ -147,6 +153,27 @@ def _describe_mcap(path: pathlib.Path) -> dict[str, object]:
         "first version [ns]": statistics.message_start_time,
         "compression": sorted({index.compression or "none" for index in summary.chunk_indexes}),
         "topics": topics,
+    }
+
+
+def _describe_broken(path: pathlib.Path) -> dict[str, object] | None:
+    """What is in a recording of ours that was cut off, up to the break; None where it is whole, or not of ours."""
+    try:
+        recording = Recording(path)
+        events = [(event.topic, event.version) for event in recording if event.kind is EventKind.COMMIT]
+    except SourceError:
+        return None
+    if recording.broken is None:
+        return None
+    versions = [version for _, version in events]
+    return {
+        "source": str(path),
+        "kind": "MCAP recording",
+        "broken": recording.broken,
+        "messages": len(events),
+        "first version [ns]": min(versions, default=0),
+        "last version [ns]": max(versions, default=0),
+        "topics": {topic: {"messages": count} for topic, count in sorted(Counter(t for t, _ in events).items())},
     }
 
 

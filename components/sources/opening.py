@@ -17,10 +17,10 @@ from .source import Source
 
 __all__ = ["SCHEMES", "open_source", "read"]
 
-SCHEMES = ("sim", "kitti", "file")
+SCHEMES = ("sim", "kitti", "mcap", "file")
 """What can stand before the colon of a source's URI; a path alone is a file or a folder of scans."""
 
-_FORMS = "sim:street?seed=7, kitti:DIR?sequence=0001, or the path of a scan or a folder of scans"
+_FORMS = "sim:street?seed=7, kitti:DIR?sequence=0001, mcap:FILE, or the path of a scan or a folder of scans"
 
 
 def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
@@ -28,6 +28,7 @@ def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
 
     - `sim:SCENARIO` — the simulator; keys seed, duration [s], rate [Hz], lidar, mounting_height [m].
     - `kitti:DIR` — a folder of the KITTI family (`KittiSource` lists the layouts); key sequence.
+    - `mcap:FILE` — a recording that `warploom record` made; key topic, by default `lidar/points`.
     - `PATH` or `file:PATH` — a scan (`.bin`, `.pcd.bin`, `.npy`, `.pcd`, `.ply`) or a folder of them.
 
     A version is the recorded stamp, else from the folder's time file, else the index × 100 ms.
@@ -60,6 +61,12 @@ def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
         if not place:
             raise ConfigError(f"{uri}: no folder after kitti:; write kitti:DIR or kitti:DIR?sequence=0001")
         return KittiSource(place, **_options(uri, keys, {"sequence": str}))
+    if scheme == "mcap":
+        if not place:
+            raise ConfigError(f"{uri}: no file after mcap:; write mcap:FILE")
+        from .recording import RecordingSource
+
+        return RecordingSource(place, **_options(uri, keys, {"topic": str}))
     _options(uri, keys, {})
     return ScanFileSource(place)
 

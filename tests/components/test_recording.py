@@ -1,6 +1,7 @@
 """The pipeline recorded, played and replayed: every commit again to the bit, on any number of workers."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -85,10 +86,34 @@ def test_another_setting_is_found_out_and_told(street):
     assert "perception.yaml is not what it was when the recording was made" in text
 
 
-def test_a_frame_fed_at_its_own_pace_is_recorded_without_holding_it_up(tmp_path):
-    summary = record_source("sim:street?seed=3&duration=0.3", tmp_path / "a.mcap", realtime=True, topics=[LIDAR_TOPIC])
-    assert summary.commits == 3
-    assert {event.topic for event in Recording(tmp_path / "a.mcap")} == {LIDAR_TOPIC}
+def test_a_run_at_its_own_pace_replays_too_whatever_it_dropped(tmp_path):
+    settings = ["perception.backlog.policy=latest"]
+    source = "sim:street?seed=3&duration=1.0&rate=40"
+    summary = record_source(source, tmp_path / "a.mcap", realtime=True, settings=settings)
+    assert not summary.dropped
+    for workers, result, _ in replay_recording(tmp_path / "a.mcap", workers=(1, 8)):
+        assert result.good, (workers, result.differences, result.hung)
+        dropped = summary.losses.get("perception", {}).get("backlog", 0)
+        assert result.equal[OBSTACLES_TOPIC] == result.fed[LIDAR_TOPIC] - dropped
+
+
+def test_the_python_of_the_docs_runs_as_it_stands(repository, tmp_path, monkeypatch, capsys):
+    text = (repository / "docs" / "recording.md").read_text(encoding="utf-8")
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[-1]
+    (tmp_path / "scans").mkdir()
+    for frame in wl.read("sim:street?seed=1&duration=0.2"):
+        frame.points.tofile(tmp_path / "scans" / f"{frame.index:06d}.bin")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "recording.md", "exec"), {"wl": wl})
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_a_recording_is_a_source_of_frames(street):
+    source = wl.read(f"mcap:{street}")
+    frames = list(source)
+    assert len(source) == len(frames) == 10
+    assert [encode(frame) for frame in frames] == [encode(frame) for frame in wl.read(SOURCE)]
+    assert next(source).version == frames[0].version
 
 
 def test_a_recording_without_the_sensor_cannot_be_replayed(tmp_path):

@@ -39,8 +39,8 @@ def test_kitti_takes_a_folder(scans):
     ("uri", "message"),
     [
         ("", "empty"),
-        ("kiti:x", r"unknown scheme 'kiti' \(did you mean 'kitti'\?\); known: sim, kitti, file"),
-        ("mcap:x.mcap", "unknown scheme 'mcap'.*known: sim, kitti, file"),
+        ("kiti:x", r"unknown scheme 'kiti' \(did you mean 'kitti'\?\); known: sim, kitti, mcap, file"),
+        ("pcap:x.pcap", "unknown scheme 'pcap'.*known: sim, kitti, mcap, file"),
         ("pcap:x.pcap?model=pandar64", "unknown scheme 'pcap'"),
         ("kitti:", "no folder after kitti:"),
         ("kitti:x?seqence=1", r"unknown key 'seqence' \(did you mean 'sequence'\?\)"),
