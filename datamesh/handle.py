@@ -125,26 +125,6 @@ class Change(Generic[T]):
         self._closed = True
         self._window.losses.count(self._window.topic, "abandoned", self._version or 0)
 
-    def _commit(self, policy: CommitPolicy | Reorder, equal: EqualVersion, triggers: bool | None) -> Status:
-        window, version, value = self._window, self._version, self._value
-        if self._closed:
-            raise RuntimeError(
-                f"this change of {window.topic!r} was committed or abandoned already; a change is committed once"
-            )
-        if version is None:
-            raise ValueError(f"the change of {window.topic!r} has no version: call set_version before the commit")
-        if value is _NOTHING:
-            raise ValueError(f"the change of {window.topic!r} has no value: set `.value` before the commit")
-        self._closed = True
-        now = window.clock.monotonic_ns()
-        received = now if self._received_ns is None else self._received_ns
-        epoch = window.epoch if self._epoch == CURRENT_EPOCH else self._epoch
-        entry = Entry(version, value, received, now, epoch, True, self._completion)
-        status = window.commit(policy, entry, equal, triggers)
-        if status is Status.REJECTED:
-            self._closed = False
-        return status
-
 
 class _Handle(Generic[T]):
     """A declared connection to a topic; unbound until the runtime gives it its window."""
@@ -315,7 +295,25 @@ class Output(_Handle[T]):
             RuntimeError: It was committed or abandoned already.
             ValueError: It has no version or no value; or `equal` is ERROR, and there is one of its version.
         """
-        return change._commit(policy, equal, triggers)
+        window, version, value = change._window, change._version, change._value
+        if change._closed:
+            raise RuntimeError(
+                f"this change of {window.topic!r} was committed or abandoned already; a change is committed once"
+            )
+        if version is None:
+            raise ValueError(f"the change of {window.topic!r} has no version: call set_version before the commit")
+        if value is _NOTHING:
+            raise ValueError(f"the change of {window.topic!r} has no value: set `.value` before the commit")
+        change._closed = True
+        now = window.clock.monotonic_ns()
+        received = now if change._received_ns is None else change._received_ns
+        epoch = window.epoch if change._epoch == CURRENT_EPOCH else change._epoch
+        status = window.commit(
+            policy, Entry(version, value, received, now, epoch, True, change._completion), equal, triggers
+        )
+        if status is Status.REJECTED:
+            change._closed = False
+        return status
 
     def settle(self, version: int, epoch: int | None = None) -> None:
         """Says that there will be nothing at `version`."""
