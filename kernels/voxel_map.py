@@ -25,6 +25,7 @@ from .voxel_table import (
     is_usable,
     key_of,
     moved_by,
+    next_slot,
     offset_in,
 )
 
@@ -180,7 +181,7 @@ def _insert_segments(
             key_of_voxel[voxel] = key
             found = wp.atomic_cas(table, slot, 0, FREE, key)
             while found != FREE:
-                slot = (slot + 64) & (table.shape[0] - 1)
+                slot = next_slot(slot, table.shape[0] - 1)
                 found = wp.atomic_cas(table, slot, 0, FREE, key)
     else:
         content = table[slot, 1]
@@ -321,7 +322,7 @@ def _rebuild(
     slot = first_slot(cell_of_key(key), table.shape[0] - 1)
     found = wp.atomic_cas(table, slot, 0, FREE, key)
     while found != FREE:
-        slot = (slot + 64) & (table.shape[0] - 1)
+        slot = next_slot(slot, table.shape[0] - 1)
         found = wp.atomic_cas(table, slot, 0, FREE, key)
     table[slot, 1] = content_of(voxel, points_in_voxel[voxel])
 

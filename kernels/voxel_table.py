@@ -23,6 +23,7 @@ __all__ = [
     "look_up",
     "moved_by",
     "nearest_in_map",
+    "next_slot",
     "offset_in",
 ]
 
@@ -107,6 +108,12 @@ def first_slot(cell: wp.vec3i, mask: int) -> int:
 
 
 @wp.func
+def next_slot(slot: int, mask: int) -> int:
+    """Where to look next: in the next cube of 64, and, the step being odd, at every slot in the end."""
+    return (slot + 65) & mask
+
+
+@wp.func
 def find_slot(table: wp.array2d(dtype=wp.int64), cell: wp.vec3i) -> int:
     """The slot of a cell, or the free one where it would be put."""
     mask = table.shape[0] - 1
@@ -114,7 +121,7 @@ def find_slot(table: wp.array2d(dtype=wp.int64), cell: wp.vec3i) -> int:
     slot = first_slot(cell, mask)
     found = table[slot, 0]
     while found != key and found != FREE:
-        slot = (slot + 64) & mask
+        slot = next_slot(slot, mask)
         found = table[slot, 0]
     return slot
 

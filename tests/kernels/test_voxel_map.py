@@ -106,6 +106,17 @@ def test_what_finds_no_room_is_counted(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_voxels_whose_cells_differ_by_multiples_of_four_find_room(method):
+    """Their places in their cubes of 64 slots are the same: the search must not stay on those."""
+    grid = np.stack(np.meshgrid(*[np.arange(10)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    xyz = np.float32(4.0 * grid + 0.5)
+    voxel_map = VoxelMap(voxel_size=1.0, capacity=1024, max_voxels=1000, method=method)
+    add(voxel_map, xyz, pose_at())
+    assert voxel_map.dropped.numpy().tolist() == [0, 0]
+    assert len(voxel_map.to_numpy()) == 1000
+
+
+@pytest.mark.parametrize("method", METHODS)
 def test_voxels_far_away_go_and_their_room_is_used_again(method):
     rng = np.random.default_rng(3)
     voxel_map = VoxelMap(voxel_size=1.0, capacity=1024, max_voxels=2600, max_distance=10.0, method=method, max_points=3)
