@@ -239,7 +239,7 @@ def cluster(
         radius: Longest step [m], > 0.
         min_size: Points that make a cluster.
         radius_per_metre: By how much the radius grows per metre of range: 0, or from 1e-5 to 1; often 0.01.
-        backend: `warp`, or `taichi`, whose labels are the same; it has one radius only.
+        backend: `warp`, or `taichi`, whose labels are the same.
 
     Returns:
         Labels, shape (n,), int32, of the same family and on the same device as `points`: clusters are numbered
@@ -249,7 +249,7 @@ def cluster(
     Raises:
         TypeError: `points` is not a floating array.
         ValueError: `points` has not at least three columns, `radius` is not positive, `min_size` is below 1, or
-            `radius_per_metre` is not from 0 to 1; or there is no such backend, or none with such a radius.
+            `radius_per_metre` is not from 0 to 1; or there is no such backend.
         ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
@@ -257,9 +257,7 @@ def cluster(
     if uses_taichi(backend):
         from .taichi import cluster as in_taichi
 
-        if radius_per_metre != 0:
-            raise ValueError(f"radius_per_metre must be 0 with backend='taichi', not {radius_per_metre}")
-        return in_taichi.cluster(borrowed, float(radius), int(min_size))
+        return in_taichi.cluster(borrowed, float(radius), int(min_size), float(radius_per_metre))
     plan = plan_for(
         EuclideanCluster,
         radius=float(radius),

@@ -101,11 +101,6 @@ def test_wrong_points_are_told(call):
         call(np.zeros((3, 2), np.float32), backend="taichi")
 
 
-def test_a_radius_that_grows_is_refused(normal):
-    with pytest.raises(ValueError, match="radius_per_metre must be 0 with backend='taichi'"):
-        wl.cluster(normal(0, 10), 0.5, radius_per_metre=0.01, backend="taichi")
-
-
 def test_threads_may_call_at_the_same_time(normal):
     clouds = [normal(seed, 3000) for seed in range(4)]
     expected = [[call(points) for call in CALLS.values()] for points in clouds]
