@@ -114,6 +114,9 @@ class Replay:
         self._runs = RecordedRuns()
         for event in logged:
             self._runs.add(event, first)
+        self._newest = {topic: max(commits) for topic, commits in self._expected.items()}
+        self._beyond: list[Difference] = []
+        self._fed: set[tuple[int, int]] = set()
         self._result = ReplayResult()
         self._lock = threading.Lock()
 
@@ -126,6 +129,8 @@ class Replay:
         mesh = self._process.mesh
         for topic in self._expected:
             mesh.window(topic).subscribe(partial(self._compare, topic), lambda *_: None)
+        for topic in self._sources:
+            mesh.window(topic).subscribe(lambda entry: self._fed.add((entry.epoch, entry.version)), lambda *_: None)
         drain = Drain(self._process, self._sources)
         if self._runs:
             self._runs.apply(self._process)
@@ -148,17 +153,25 @@ class Replay:
         result = self._result
         result.fed = player.published
         result.broken = self._recording.broken
+        last = max(self._fed, default=(-1, -1))
         for topic, commits in self._expected.items():
             for (epoch, version), hashes in commits.items():
-                for _ in hashes:
-                    self._differ(Difference(topic, epoch, version, "missing"))
+                # At a break, data can be in the file of which the results are not, and the other way round.
+                if result.broken is None or (epoch, version) <= last:
+                    for _ in hashes:
+                        self._differ(Difference(topic, epoch, version, "missing"))
+        if result.broken is None:
+            for difference in self._beyond:
+                self._differ(difference)
         return result
 
     def _compare(self, topic: str, entry: Entry) -> None:
         made = digest(encode(entry.value))
         with self._lock:
             hashes = self._expected[topic].get((entry.epoch, entry.version))
-            if not hashes:
+            if not hashes and (entry.epoch, entry.version) > self._newest[topic]:
+                self._beyond.append(Difference(topic, entry.epoch, entry.version, "extra"))
+            elif not hashes:
                 self._differ(Difference(topic, entry.epoch, entry.version, "extra"))
             elif hashes.pop(0) != made:
                 self._differ(Difference(topic, entry.epoch, entry.version, "differs"))

@@ -25,6 +25,7 @@ from .engine import VertexTiming
 __all__ = ["Trace"]
 
 _FLUSH = 0.5  # [s]
+_REMEMBERED = 10_000  # frames whose arrows can go on
 _MOST = 200_000  # events that may wait for the disk: some 40 MB
 
 _log = logging.getLogger(__name__)
@@ -55,6 +56,7 @@ class Trace:
         self._events: deque[tuple[Any, ...]] = deque()
         self._threads: dict[int, str] = {}
         self._numbers_of: dict[tuple[int, int], int] = {}
+        self._frames = 0
         self._on_way: set[tuple[int, int]] = set()
         self._lost: dict[str, int] = {}
         self._numbers = 0
@@ -176,7 +178,12 @@ class Trace:
 
     def _arrow(self, version: int, epoch: int, stamp: float, here: dict[str, Any], phase: str) -> dict[str, Any]:
         # Versions are too large for the numbers of JSON, so the frames are numbered.
-        number = self._numbers_of.setdefault((epoch, version), len(self._numbers_of) + 1)
+        number = self._numbers_of.get((epoch, version))
+        if number is None:
+            self._frames += 1
+            number = self._numbers_of[epoch, version] = self._frames
+            if len(self._numbers_of) > _REMEMBERED:
+                del self._numbers_of[next(iter(self._numbers_of))]
         ends = {"bp": "e"} if phase == "f" else {}
         return {"name": "version", "cat": "version", "ph": phase, "id": number, "ts": stamp, **here, **ends}
 
