@@ -1,5 +1,6 @@
 """The command as a user runs it: outputs, messages, exit codes."""
 
+import io
 import json
 import pathlib
 import subprocess
@@ -162,7 +163,7 @@ def test_graph_draws_a_picture_of_a_module_or_a_whole_profile(warploom):
         assert {"lidar/points", "filter", "track", "perception (dag)", "perception/obstacles"} <= texts
 
 
-def test_a_recorded_run_is_replayed_and_played(warploom, tmp_path):
+def test_a_recorded_run_is_replayed_and_played(warploom, monkeypatch):
     output = warploom("record", "--source", "sim:street?seed=7&duration=0.5", "--out", "a.mcap")
     assert "a.mcap: 5 frames, 20 commits" in output
     output = warploom("replay", "a.mcap", "--verify", "--workers", 1, "--workers", 2, "--workers", 8)
@@ -173,6 +174,9 @@ def test_a_recorded_run_is_replayed_and_played(warploom, tmp_path):
     assert "differs" in output
     output = warploom("play", "a.mcap", "--fast", "--seek", 0.2, "--loop", 2, "--topic", "lidar/points")
     assert "played 6 of lidar/points" in output
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n\nq\n"))
+    output = warploom("play", "a.mcap", "--step", "--topic", "perception/obstacles")
+    assert "played 2 of perception/obstacles" in output, "one for each Enter; the third was a q"
     assert warploom("info", "a.mcap").count("warploom.SensorFrame") == 1
 
 

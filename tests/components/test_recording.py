@@ -1,5 +1,6 @@
 """The pipeline recorded, played and replayed: every commit again to the bit, on any number of workers."""
 
+import errno
 import json
 import re
 
@@ -10,6 +11,7 @@ import warploom as wl
 from warploom.components.messages import Obstacles, PointLabels, SensorFrame
 from warploom.components.pipeline import LIDAR_TOPIC, OBSTACLES_TOPIC, POINTS_TOPIC
 from warploom.components.recording import play_recording, record_source, replay_lines, replay_recording
+from warploom.datamesh import recording as recording_module
 from warploom.datamesh.messages import encode
 from warploom.datamesh.recording_reader import Recording
 from warploom.errors import ConfigError, SourceError
@@ -114,6 +116,31 @@ def test_a_recording_is_a_source_of_frames(street):
     assert len(source) == len(frames) == 10
     assert [encode(frame) for frame in frames] == [encode(frame) for frame in wl.read(SOURCE)]
     assert next(source).version == frames[0].version
+
+
+def test_a_full_disk_ends_the_recording_and_the_run_goes_on_and_says_so(tmp_path, monkeypatch, caplog):
+    written = 0
+    write = recording_module._File.write
+
+    def until_full(self, data):
+        nonlocal written
+        written += len(data)
+        if written > 6_000_000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, data)
+
+    monkeypatch.setattr(recording_module._File, "write", until_full)
+    summary = record_source("sim:street?seed=3&duration=0.6", tmp_path / "a.mcap", compression="none")
+    assert summary.frames == 6
+    assert summary.failure == "No space left on device"
+    assert summary.commits + sum(summary.dropped.values()) == 24
+    assert summary.losses["recorder lidar/points"]["disk"] >= 3
+    text = "\n".join(summary.lines())
+    assert "the recording broke off: No space left on device; the run went on without it" in text
+    assert f"{summary.dropped['disk']} commits were not recorded: disk" in text
+    (_, result, _) = next(iter(replay_recording(tmp_path / "a.mcap")))
+    assert result.broken is not None
+    assert result.different == 0
 
 
 def test_a_recording_without_the_sensor_cannot_be_replayed(tmp_path):
