@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-from ..datamesh import DataMesh, Entry, LossCounters
+from ..datamesh import DataMesh, Entry, LossCounters, Status
 from .engine import VertexTiming
 
 __all__ = ["Histogram", "Metrics"]
@@ -25,7 +25,7 @@ class Histogram:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._buckets: Counter[int] = Counter()
+        self._buckets: dict[int, int] = {}
         self.count = 0
         self.total = 0.0
         self.max = 0.0
@@ -34,10 +34,11 @@ class Histogram:
         """Adds a value [ms]; below zero counts as zero."""
         bucket = 0 if value <= _SMALLEST else 1 + int(math.log(value / _SMALLEST) / _GROWTH)
         with self._lock:
-            self._buckets[bucket] += 1
+            self._buckets[bucket] = self._buckets.get(bucket, 0) + 1
             self.count += 1
             self.total += value
-            self.max = max(self.max, value)
+            if value > self.max:
+                self.max = value
 
     def quantile(self, q: float) -> float:
         """The value that a share `q` of all does not exceed, within 2 %; NaN without any.
@@ -79,8 +80,8 @@ class Metrics:
         """By topic."""
         self.settled: Counter[str] = Counter()
         """Versions without a datum, by topic."""
-        self.runs: Counter[tuple[str, str]] = Counter()
-        """By vertex, as `component.vertex`, and status."""
+        self._runs: Counter[tuple[str, str, Status]] = Counter()
+        self._vertices: dict[tuple[str, str], tuple[Histogram, Histogram]] = {}
         self.latency: dict[str, Histogram] = {}
         """From when the sensor's data was received to the commit, by topic: waits included [ms]."""
         self.wait: dict[str, Histogram] = {}
@@ -106,20 +107,34 @@ class Metrics:
 
     def on_timing(self, timing: VertexTiming) -> None:
         """Takes up the run of a vertex."""
-        vertex = f"{timing.component}.{timing.vertex}"
+        component, vertex, _, ready, start, end, status = timing[:7]
+        histograms = self._vertices.get((component, vertex)) or self._add(component, vertex)
         with self._lock:
-            self.runs[vertex, timing.status.name.lower()] += 1
-            if vertex not in self.run:
-                self.run[vertex], self.wait[vertex] = Histogram(), Histogram()
-        self.run[vertex].observe(timing.run_ms)
-        self.wait[vertex].observe(timing.wait_ms)
+            self._runs[component, vertex, status] += 1
+        histograms[0].observe((start - ready) / 1e6)
+        histograms[1].observe((end - start) / 1e6)
+
+    def _add(self, component: str, vertex: str) -> tuple[Histogram, Histogram]:
+        with self._lock:
+            name = f"{component}.{vertex}"
+            if name not in self.run:
+                self.wait[name], self.run[name] = Histogram(), Histogram()
+            self._vertices[component, vertex] = self.wait[name], self.run[name]
+            return self._vertices[component, vertex]
+
+    def runs(self) -> list[tuple[str, str, int]]:
+        """How many runs of each vertex ended how: the vertex as `component.vertex`, the status, the count."""
+        with self._lock:
+            counts = dict(self._runs)
+        named = ((f"{c}.{vertex}", status.name.lower(), count) for (c, vertex, status), count in counts.items())
+        return sorted(named)
 
     def as_dict(self) -> dict[str, Any]:
         """All of it as plain values."""
+        runs: dict[str, dict[str, int]] = {}
+        for vertex, status, count in self.runs():
+            runs.setdefault(vertex, {})[status] = count
         with self._lock:
-            runs: dict[str, dict[str, int]] = {}
-            for (vertex, status), count in sorted(self.runs.items()):
-                runs.setdefault(vertex, {})[status] = count
             vertices = sorted(self.run)
             counts = {"commits": dict(sorted(self.commits.items())), "settled": dict(sorted(self.settled.items()))}
         return {
@@ -134,7 +149,7 @@ class Metrics:
     def prometheus(self) -> str:
         """All of it in Prometheus' text format."""
         with self._lock:
-            commits, runs = sorted(self.commits.items()), sorted(self.runs.items())
+            commits = sorted(self.commits.items())
             latency, wait, run = (sorted(some.items()) for some in (self.latency, self.wait, self.run))
         lines = ["# TYPE warploom_commits_total counter"]
         lines += [_line("warploom_commits_total", {"topic": topic}, count) for topic, count in commits]
@@ -143,7 +158,8 @@ class Metrics:
             lines += [_line("warploom_losses_total", {"place": place, "reason": r}, n) for r, n in reasons.items()]
         lines.append("# TYPE warploom_vertex_runs_total counter")
         lines += [
-            _line("warploom_vertex_runs_total", {"vertex": vertex, "status": status}, n) for (vertex, status), n in runs
+            _line("warploom_vertex_runs_total", {"vertex": vertex, "status": status}, n)
+            for vertex, status, n in self.runs()
         ]
         lines += _histogram("warploom_latency_milliseconds", "topic", latency)
         lines += _histogram("warploom_vertex_wait_milliseconds", "vertex", wait)
