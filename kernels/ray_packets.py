@@ -53,7 +53,7 @@ _TRAVERSAL = """
             // A little wider than it is, for what rounding took.
             const int hit = (in <= out * 1.000001f) & (in < best[k]);
             int bits;
-            __builtin_memcpy(&bits, &in, 4);
+            memcpy(&bits, &in, 4);
             bits = hit ? bits : never;
             first = bits < first ? bits : first;
         }
@@ -93,7 +93,7 @@ _TRAVERSAL = """
             float farthest = 0.0f;
             for (int k = 0; k < WIDTH; ++k) farthest = best[k] > farthest ? best[k] : farthest;
             int limit;
-            __builtin_memcpy(&limit, &farthest, 4);
+            memcpy(&limit, &farthest, 4);
             do {
                 if (depth == 0) return;
                 --depth;
