@@ -136,7 +136,8 @@ def _best_score(average: AverageMot) -> float:
 
 def _from_score(table: TrackTable, score: float) -> TrackTable:
     """The tracks of this score or a higher one."""
-    assert table.scores is not None and table.ignored is not None
+    assert table.scores is not None
+    assert table.ignored is not None
     kept = table.scores >= score
     return TrackTable(
         frames=table.frames[kept],
