@@ -51,7 +51,8 @@ def spconv_voxelizer(points):
         max_num_points_per_voxel=PILLARS["max_points"],
     )
     tensorview = peer("cumm.tensorview", "spconv")
-    return lambda: [part.numpy() for part in generator.point_to_voxel(tensorview.from_numpy(points))]
+    own = points.copy()  # spconv wants to be able to write to it, also where another benchmark has frozen the cloud
+    return lambda: [part.numpy() for part in generator.point_to_voxel(tensorview.from_numpy(own))]
 
 
 def same_voxels(ours, theirs):
