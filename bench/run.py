@@ -176,6 +176,8 @@ def _measure(written: Path, filters: Sequence[str], device: str, quick: bool) ->
                 [str(_FOLDER), *map(str, options), *(f"--benchmark-{option}" for option in benchmark)],
                 plugins=[selection],
             )
+    if not selection.names and not selection.failures:
+        raise BenchmarkError(f"pytest ended with {code!r}: {said.getvalue()[-2000:]}")
     if selection.selected == 0 and not selection.failures:
         raise ConfigError(
             f"no benchmark's name has {' or '.join(map(repr, filters))}; there are {', '.join(selection.names)}"

@@ -20,7 +20,9 @@ def bench(tmp_path_factory):
 
     def run(*arguments, expect=0, **environment):
         command = [sys.executable, "-c", "from warploom.cli import main; main()", "bench", *map(str, arguments)]
-        environment = {**os.environ, "COLUMNS": "250", **environment}
+        # A worker of xdist is told so by its environment, and pytest-benchmark then measures nothing.
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+        environment = {**inherited, "COLUMNS": "250", **environment}
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == expect, done.stdout + done.stderr
         return " ".join((done.stdout + done.stderr).split())
