@@ -16,7 +16,7 @@ from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ...models.evaluation.tracking import TrackTable
 from ...models.geometry import KittiCalibration, box_corners, invert, kitti_poses
 
-__all__ = ["TYPES", "ObjectType", "TrackingSequence", "detected_type", "sequence_names", "write_results"]
+__all__ = ["TYPES", "ObjectType", "TrackingSequence", "detection_format", "sequence_names", "write_results"]
 
 _AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # renamed from the camera's
 _IMAGE = (1242.0, 375.0)  # pixels
@@ -72,22 +72,21 @@ def sequence_names(data: pathlib.Path, detections: pathlib.Path) -> list[str]:
     return names
 
 
-def detected_type(detections: pathlib.Path, names: list[str]) -> ObjectType:
-    """The one type of object that the detections are of.
+def detection_format(detections: pathlib.Path, names: list[str]) -> tuple[ObjectType, bool]:
+    """The one type of object that the detections are of, and whether their scores are logits.
+
+    They are where any score of any sequence lies outside [0, 1].
 
     Raises:
         SourceError: They are of none that KITTI evaluates, or of several.
     """
-    numbers: set[int] = set()
-    for name in names:
-        rows = _numbers(detections / f"{name}.txt", ",")
-        if rows.size:
-            numbers |= set(rows[:, 1].astype(int).tolist())
+    tables = [rows for name in names if (rows := _numbers(detections / f"{name}.txt", ",")).size]
+    numbers = {int(number) for rows in tables for number in np.unique(rows[:, 1])}
     found = [kind for kind in TYPES if kind.number in numbers]
     if len(numbers) != 1 or not found:
         known = ", ".join(f"{kind.number} {kind.name}" for kind in TYPES)
         raise SourceError(f"{detections}: types {sorted(numbers)} in the second column; expected one of {known}")
-    return found[0]
+    return found[0], any(bool(((rows[:, 6] < 0.0) | (rows[:, 6] > 1.0)).any()) for rows in tables)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -103,8 +102,6 @@ class TrackingSequence:
     """Detections of each frame, x y z l w h yaw, renamed axes, shapes (n, 7)."""
     scores: list[np.ndarray]
     """Their scores in [0, 1], shapes (n,)."""
-    logits: bool
-    """Whether the file has logits, as any score outside [0, 1] shows."""
     poses: np.ndarray | None
     """World from the renamed frame for each of `frames`, shape (f, 4, 4); None without GPS/IMU records."""
     dont_care: dict[int, np.ndarray]
@@ -114,7 +111,7 @@ class TrackingSequence:
 
     @classmethod
     def read(
-        cls, data: pathlib.Path, detections: pathlib.Path, name: str, kind: ObjectType, *, logits: bool | None = None
+        cls, data: pathlib.Path, detections: pathlib.Path, name: str, kind: ObjectType, *, logits: bool = False
     ) -> TrackingSequence:
         """Reads a sequence.
 
@@ -126,7 +123,7 @@ class TrackingSequence:
             detections: Folder with `NAME.txt`: frame, type, image box (4), score, h w l x y z ry, alpha.
             name: Of the sequence, such as `0001`.
             kind: The type to read.
-            logits: Whether scores are logits; None looks into this file alone.
+            logits: Whether scores are logits, as `detection_format` tells.
 
         Raises:
             SourceError: A file is missing or damaged.
@@ -146,8 +143,6 @@ class TrackingSequence:
             poses = kitti_poses(records, calibration.lidar_from_imu)
             poses = poses @ invert(calibration.rectified_from_lidar) @ _AXES.T
         frames = np.arange(first, count)
-        if logits is None:
-            logits = bool(((found[:, 6] < 0.0) | (found[:, 6] > 1.0)).any())
         scores = 1.0 / (1.0 + np.exp(-found[:, 6])) if logits else found[:, 6]
         each = [np.flatnonzero(found[:, 0] == frame) for frame in frames]
         return cls(
@@ -161,7 +156,6 @@ class TrackingSequence:
             ),
             boxes=[_renamed(found[rows, 7:14]) for rows in each],
             scores=[scores[rows] for rows in each],
-            logits=logits,
             poses=poses,
             dont_care=dont_care,
             projection=calibration.projection[_CAMERA],

@@ -15,7 +15,7 @@ from ...errors import SourceError
 from ...models.evaluation.hota import Hota, hota
 from ...models.evaluation.tracking import AverageMot, TrackTable, average_mot
 from ...models.tracker import Tracker, TrackerConfig
-from .kitti_tracking import ObjectType, TrackingSequence, detected_type, sequence_names, write_results
+from .kitti_tracking import ObjectType, TrackingSequence, detection_format, sequence_names, write_results
 from .plots import draw_recall
 
 __all__ = ["OVERLAPS", "TrackingEvaluation", "evaluate_tracking", "lines_of", "track", "track_confidences"]
@@ -179,8 +179,7 @@ def evaluate_tracking(
     if unknown:
         raise SourceError(f"no sequence {', '.join(unknown)} with labels and detections; there are: {', '.join(known)}")
     names = list(sequences) or known
-    kind = detected_type(folder, names)
-    logits = any(TrackingSequence.read(data, folder, name, kind).logits for name in names)
+    kind, logits = detection_format(folder, names)
     read = [TrackingSequence.read(data, folder, name, kind, logits=logits) for name in names]
 
     out.mkdir(parents=True, exist_ok=True)

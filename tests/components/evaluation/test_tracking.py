@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from warploom.components.evaluation.kitti_tracking import TYPES, TrackingSequence
+from warploom.components.evaluation.kitti_tracking import TYPES, TrackingSequence, detection_format
 from warploom.components.evaluation.tracking import evaluate_tracking, lines_of, track_confidences
 from warploom.components.perception.tracker_settings import TrackerSettings, load_tracker
 from warploom.errors import ConfigError, SourceError
@@ -55,10 +55,11 @@ def data(tmp_path):
 
 
 def test_reads_labels_detections_and_areas(data):
-    sequence = TrackingSequence.read(data, data / "found_Car", "0007", CAR)
+    kind, logits = detection_format(data / "found_Car", ["0007"])
+    assert (kind, logits) == (CAR, True)
+    sequence = TrackingSequence.read(data, data / "found_Car", "0007", kind, logits=logits)
     assert len(sequence.frames) == 30
     assert sequence.poses is None
-    assert sequence.logits
     # Camera x right, y down, z forward: here x forward, y left, z up, and the centre in place of the bottom's.
     np.testing.assert_allclose(
         sequence.truth.boxes[0], [12, -2, 0.75 - 1.7, 4.2, 1.8, 1.5, 1.57 - np.pi / 2], atol=1e-12
