@@ -1,0 +1,32 @@
+"""The command `warploom`."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from ..errors import ConfigError, DeviceError, ModelError, WarploomError
+from . import inspecting, measuring, recording, running
+from .application import app
+
+__all__ = ["app", "main"]
+
+# In the order in which the help lists them.
+for _part in (running, inspecting, recording, measuring):
+    app.add_typer(_part.commands)
+
+
+def main() -> None:
+    """Runs the command: exit code 0 when it is done, 2 for bad usage or configuration, 1 when it failed."""
+    try:
+        app()
+    except (ConfigError, DeviceError, ModelError) as error:
+        typer.echo(f"warploom: {error}", err=True)
+        sys.exit(2)
+    except WarploomError as error:
+        typer.echo(f"warploom: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        typer.echo("warploom: interrupted", err=True)
+        sys.exit(130)
