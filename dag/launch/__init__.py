@@ -1,0 +1,1 @@
+"""The launcher: launch files, preflight, the supervisor of a node's processes and its control plane."""
