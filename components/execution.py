@@ -2,12 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import warp as wp
 
-__all__ = ["ExecutionContext", "empty_cloud"]
+from ..dag import VertexTiming
+
+__all__ = ["ExecutionContext", "Timings", "empty_cloud"]
+
+
+class Timings:
+    """Hands the timings of a process's vertices to whoever watches; it is the process's `on_timing`."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._watchers: tuple[Callable[[VertexTiming], None], ...] = ()
+
+    def __call__(self, timing: VertexTiming) -> None:
+        """Takes the timing of one run."""
+        for watcher in self._watchers:
+            watcher(timing)
+
+    def watch(self, callback: Callable[[VertexTiming], None]) -> None:
+        """Calls back after every run of a vertex, in the thread that ran it."""
+        with self._lock:
+            self._watchers = (*self._watchers, callback)
+
+    def forget(self, callback: Callable[[VertexTiming], None]) -> None:
+        """Calls back no more."""
+        with self._lock:
+            self._watchers = tuple(one for one in self._watchers if one != callback)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,8 +51,20 @@ class ExecutionContext:
     """Height of the LiDAR above the ground [m]; None: estimated in each frame."""
     inference_threads: int = 2
     """Threads of a detection head on a CPU."""
+    precision: str = "fp32"
+    """What a detection head on a GPU computes in: fp32, tf32 or fp16."""
     detector: Path | None = None
     """Card of the detection head; None is the shipped one."""
+    backends: Mapping[str, str] = MappingProxyType({})
+    """Which library computes a kernel, by its name, where that is not Warp and the module file does not say."""
+    sensors: Mapping[str, Any] = MappingProxyType({})
+    """The sensors of the profile by name: each a `profile.SensorSpec`."""
+    sensor_kinds: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    """Names of the sensors by kind."""
+    latency_budget_ms: float = 100.0
+    """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
+    timings: Timings = field(default_factory=Timings, compare=False)
+    """Tells the runs of vertices, if the process was built with it as its `on_timing`."""
 
 
 def empty_cloud(device: str) -> tuple[wp.array, wp.array]:
@@ -32,4 +73,6 @@ def empty_cloud(device: str) -> tuple[wp.array, wp.array]:
     Returns:
         Positions with room for one point, vec3, and the count zero, int32, both on `device`.
     """
+    import warp as wp
+
     return wp.zeros(1, dtype=wp.vec3, device=device), wp.zeros(1, dtype=wp.int32, device=device)
