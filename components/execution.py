@@ -6,12 +6,12 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
-
-import warp as wp
+from typing import TYPE_CHECKING, Any
 
 from ..dag import VertexTiming
+
+if TYPE_CHECKING:
+    import warp as wp
 
 __all__ = ["ExecutionContext", "Timings", "empty_cloud"]
 
@@ -55,11 +55,11 @@ class ExecutionContext:
     """What a detection head on a GPU computes in: fp32, tf32 or fp16."""
     detector: Path | None = None
     """Card of the detection head; None is the shipped one."""
-    backends: Mapping[str, str] = MappingProxyType({})
+    backends: Mapping[str, str] = field(default_factory=dict)
     """Which library computes a kernel, by its name, where that is not Warp and the module file does not say."""
-    sensors: Mapping[str, Any] = MappingProxyType({})
+    sensors: Mapping[str, Any] = field(default_factory=dict)
     """The sensors of the profile by name: each a `profile.SensorSpec`."""
-    sensor_kinds: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    sensor_kinds: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Names of the sensors by kind."""
     latency_budget_ms: float = 100.0
     """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
