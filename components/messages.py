@@ -12,7 +12,16 @@ from ..datamesh.messages import message
 from ..models.classes import CLASSES
 from ..models.detections import Detections
 
-__all__ = ["DetectedObjects", "Obstacle", "Obstacles", "PointLabels", "SensorFrame", "Truth"]
+__all__ = [
+    "CameraObjects",
+    "DetectedObjects",
+    "Obstacle",
+    "Obstacles",
+    "PointLabels",
+    "RadarObjects",
+    "SensorFrame",
+    "Truth",
+]
 
 message("warploom.Detections")(Detections)
 
@@ -75,6 +84,56 @@ class DetectedObjects:
     detections: Detections
     missing_inputs: tuple[str, ...] = ()
     """Inputs that this frame had to do without."""
+
+
+@message("warploom.CameraObjects")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraObjects:
+    """The objects that a detector found in one image of a camera."""
+
+    version: int
+    """Time of the exposure [ns], on the LiDAR's clock."""
+    sensor: str
+    """Name of the camera."""
+    boxes: np.ndarray
+    """Left, top, right, bottom in the image [pixels], shape (k, 4), float32."""
+    scores: np.ndarray
+    """Confidence in [0, 1], shape (k,), float32."""
+    classes: np.ndarray
+    """Indices into `models.classes.CLASSES`, shape (k,), int32."""
+    projection: np.ndarray
+    """Homogeneous pixels from the LiDAR's frame, both at rest: u w, v w, w, where w is the depth [m] and above zero
+    before the camera; shape (3, 4), float64."""
+    size: tuple[int, int]
+    """Width and height of the image [pixels]."""
+    pose: np.ndarray | None = None
+    """World from the LiDAR's frame at the time of the exposure, shape (4, 4), float64; None where unknown."""
+
+
+@message("warploom.RadarObjects")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RadarObjects:
+    """The targets that a radar saw in one cycle."""
+
+    version: int
+    """Time of the measurement [ns], on the LiDAR's clock."""
+    sensor: str
+    """Name of the radar."""
+    positions: np.ndarray
+    """x y z in the radar's own frame [m], shape (k, 3), float32; z is 0 where it measures no elevation."""
+    radial_velocities: np.ndarray
+    """As measured: relative to the radar and along the line of sight, positive for what goes away [m/s]; shape (k,),
+    float32."""
+    scores: np.ndarray
+    """Probability that there is something, in [0, 1], shape (k,), float32."""
+    mounting: np.ndarray
+    """LiDAR's frame from the radar's, shape (4, 4), float64."""
+    velocity: np.ndarray | None = None
+    """Of the radar itself over ground, along the axes of its frame [m/s], shape (3,), float64; None where unknown."""
+    pose: np.ndarray | None = None
+    """World from the LiDAR's frame at the time of the measurement, shape (4, 4), float64; None where unknown."""
+    cross_section: np.ndarray | None = None
+    """Radar cross section [dBm²], shape (k,), float32; None where unknown."""
 
 
 @message("warploom.PointLabels")
