@@ -16,9 +16,8 @@ import numpy as np
 from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, load_module, nearest, parse_overrides
 from ..datamesh import CommitPolicy, DataMesh, Entry, Output
 from ..errors import ConfigError, SourceError
-from ..kernels.device import resolve_device
 from .messages import Obstacles, PointLabels, SensorFrame
-from .profile import CONF, Profile, execution_context, load_profile
+from .profile import CONF, Profile, execution_context, load_profile, profile_device, use_threads
 
 __all__ = ["LIDAR_TOPIC", "OBSTACLES_TOPIC", "POINTS_TOPIC", "Latency", "PerceptionFrame", "Pipeline", "StageLatency"]
 
@@ -177,7 +176,8 @@ class Pipeline:
                 raise ConfigError(
                     f"setting {'.'.join(keys)}: no component {keys[0]!r}; {nearest(keys[0], {*known, 'profile'})}"
                 )
-        return cls(profile, modules, resolve_device(device or profile.content.device))
+        use_threads(profile.content)
+        return cls(profile, modules, profile_device(profile.content, device))
 
     @property
     def profile(self) -> Profile:
@@ -287,7 +287,7 @@ def profile_modules(
             path = _find_module(profile, name)
         except ConfigError as error:
             raise profile.error(["modules", index], str(error)) from None
-        files.append(load_module(path, {**settings, **changes}, profile.content.sensors))
+        files.append(load_module(path, {**settings, **changes}, profile.content.sensor_names))
     known = {component.name for file in files for component in file.content.components}
     for key in profile.content.settings:
         if key.split(".")[0] not in known:

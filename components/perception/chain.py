@@ -44,9 +44,10 @@ class ChainProcessor(Processor):
         Raises:
             ValueError: The backend is not Warp.
         """
-        if config.backend != "warp":
-            raise ValueError(f"backend must be 'warp' in a chain, not {config.backend!r}; single stages have others")
         context = self.context
+        for backend in (config.backend, *context.backends.values()):
+            if backend not in (None, "warp"):
+                raise ValueError(f"backend must be 'warp' in a chain, not {backend!r}; single stages have others")
         stages = ChainConfig(
             stages=("cluster",),
             point_range=config.point_range,

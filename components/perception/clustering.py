@@ -45,8 +45,9 @@ class ClusterConfig(ProcessorConfig):
     """Points lower above the ground are left out [m]."""
     max_height: float = 4.0
     """Points higher above the ground are left out: a vehicle passes beneath them [m]."""
-    backend: Backend = "warp"
-    """What computes: warp, or taichi, taichi:cpu, taichi:vulkan, taichi:metal, taichi:cuda; the labels are the same."""
+    backend: Backend | None = None
+    """What computes: warp, or taichi, taichi:cpu, taichi:vulkan, taichi:metal, taichi:cuda, the labels are the same;
+    null: what the profile says, or else warp."""
 
 
 class ClusterProcessor(Processor):
@@ -69,10 +70,11 @@ class ClusterProcessor(Processor):
         self._config = config
         self._include = wp.zeros(capacity, dtype=wp.bool, device=device)
         what = {"radius": config.radius, "radius_per_metre": config.radius_per_metre, "min_size": config.min_size}
-        if uses_taichi(config.backend):
+        self._backend = config.backend or self.context.backends.get("cluster", "warp")
+        if uses_taichi(self._backend):
             from ...kernels.taichi import cluster as in_taichi
 
-            self._in_taichi = in_taichi.EuclideanCluster(**what, capacity=capacity, device=config.backend)
+            self._in_taichi = in_taichi.EuclideanCluster(**what, capacity=capacity, device=self._backend)
             self._in_taichi.launch(np.zeros((1, 3), np.float32), 0, np.zeros(1, np.int32))
             return
         plans = [EuclideanCluster(**what, capacity=capacity, device=device) for _ in range(self.in_flight)]
@@ -87,7 +89,7 @@ class ClusterProcessor(Processor):
         include = self._include[:n]
         bounds = (self._config.min_height, self._config.max_height)
         select_heights(ground.mask, ground.height, cloud.count, bounds, include)
-        if self._config.backend != "warp":
+        if self._backend != "warp":
             self.clusters.value = self._cluster_in_taichi(cloud.xyz, include)
             return Status.OK
         plan = next(self._plans)

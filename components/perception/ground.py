@@ -33,8 +33,9 @@ class GroundSurface:
 class GroundConfig(ProcessorConfig):
     """How the ground is found."""
 
-    backend: Backend = "warp"
-    """What computes: warp, or taichi, taichi:cpu, taichi:vulkan, taichi:metal, taichi:cuda."""
+    backend: Backend | None = None
+    """What computes: warp, or taichi, taichi:cpu, taichi:vulkan, taichi:metal, taichi:cuda; null: what the profile
+    says, or else warp."""
 
 
 class GroundProcessor(Processor):
@@ -53,9 +54,9 @@ class GroundProcessor(Processor):
             DeviceError: Taichi cannot compute on its device.
         """
         context = self.context
-        self._backend = config.backend
-        if uses_taichi(config.backend):
-            segment_ground(empty_cloud(context.device)[0], backend=config.backend)
+        self._backend = config.backend or context.backends.get("ground", "warp")
+        if uses_taichi(self._backend):
+            segment_ground(empty_cloud(context.device)[0], backend=self._backend)
             return
         plans = [
             GroundSegment(capacity=context.capacity, sensor_height=context.mounting_height, device=context.device)
