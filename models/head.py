@@ -23,11 +23,14 @@ from .card import DEFAULT_CARD, HeadCard, load_card
 from .classes import CLASSES
 from .detections import Detections
 
-__all__ = ["DetectionHead"]
+__all__ = ["PRECISIONS", "DetectionHead"]
 
 _log = logging.getLogger(__name__)
 
-_PROVIDERS = {"cpu": ["CPUExecutionProvider"], "cuda": ["CUDAExecutionProvider", "CPUExecutionProvider"]}
+PRECISIONS = ("fp32", "tf32", "fp16")
+"""What a network on a GPU can compute in; on a CPU it is always fp32."""
+
+_ON_CUDA = ("TensorrtExecutionProvider", "CUDAExecutionProvider")
 
 
 class DetectionHead:
@@ -38,6 +41,8 @@ class DetectionHead:
         device: A Warp device, such as `cpu` or `cuda:0`; the kernels run there, and the network too where ONNX
             Runtime has a provider for it, else on the CPU, which is logged and said by `provider`.
         threads: CPU threads of the network.
+        precision: What the network computes in on a GPU, one of `PRECISIONS`; fp16 needs ONNX Runtime's provider for
+            TensorRT, and is tf32 without it, which is logged. A CPU computes in fp32.
         score_threshold: Least score of a detection; None is the card's.
         capacity: Most points of a cloud.
 
@@ -51,6 +56,7 @@ class DetectionHead:
         *,
         device: str = "cpu",
         threads: int = 2,
+        precision: str = "fp32",
         score_threshold: float | None = None,
         capacity: int = 1 << 18,
     ):
@@ -58,6 +64,8 @@ class DetectionHead:
             raise ValueError(f"score_threshold must be in [0, 1], not {score_threshold}")
         if threads < 1:
             raise ValueError(f"threads must be at least 1, not {threads}")
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, not {precision!r}")
         self.card, model = load_card(card or DEFAULT_CARD)
         self.device = resolve_device(device)
         self.score_threshold = self.card.decode.score_threshold if score_threshold is None else score_threshold
@@ -68,7 +76,7 @@ class DetectionHead:
         self._pillars = PillarGrid(
             point_range=self.card.input.point_range, cell=self.card.input.cell, capacity=capacity, device=self.device
         )
-        self._session, self.provider = _session(model, self.card, self.device, threads)
+        self._session, self.provider = _session(model, self.card, self.device, threads, precision)
         self._count = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._bind()
         decode = self.card.decode
@@ -94,7 +102,7 @@ class DetectionHead:
     def _bind(self) -> None:
         """Binds the network to buffers of ours: the pillars' own where the network runs on the same device."""
         self._binding = self._session.io_binding()
-        shared = self.device == "cpu" or self.provider == "CUDAExecutionProvider"
+        shared = self.device == "cpu" or self.provider in _ON_CUDA
         self._maps = wp.zeros(self.card.output.shape, dtype=wp.float32, device=self.device)
         host = None if shared else "cpu"
         self._network_in = (
@@ -171,7 +179,22 @@ class DetectionHead:
         )
 
 
-def _session(model: Path, card: HeadCard, device: str, threads: int) -> tuple[Any, str]:
+def _providers(available: list[str], gpu: int | None, precision: str) -> list[str | tuple[str, dict[str, Any]]]:
+    """What ONNX Runtime is to run a network on, the best first, with options."""
+    if gpu is None:
+        return ["CPUExecutionProvider"]
+    providers: list[str | tuple[str, dict[str, Any]]] = []
+    if precision == "fp16":
+        if "TensorrtExecutionProvider" in available:
+            providers.append(("TensorrtExecutionProvider", {"device_id": gpu, "trt_fp16_enable": True}))
+        elif "CUDAExecutionProvider" in available:
+            _log.warning("ONNX Runtime has no TensorRT provider here, which fp16 needs: the network computes in tf32")
+    if "CUDAExecutionProvider" in available:
+        providers.append(("CUDAExecutionProvider", {"device_id": gpu, "use_tf32": int(precision != "fp32")}))
+    return [*providers, "CPUExecutionProvider"]
+
+
+def _session(model: Path, card: HeadCard, device: str, threads: int, precision: str) -> tuple[Any, str]:
     """An ONNX Runtime session whose model was checked against its card, and the provider it runs on."""
     import onnxruntime as ort
 
@@ -181,12 +204,8 @@ def _session(model: Path, card: HeadCard, device: str, threads: int) -> tuple[An
     # A thread that waits by spinning takes a core from the stages that run beside the head.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
-    available = ort.get_available_providers()
-    providers = [name for name in _PROVIDERS[device.partition(":")[0]] if name in available]
-    settings = [
-        (name, {"device_id": wp.get_device(device).ordinal}) if name == "CUDAExecutionProvider" else name
-        for name in providers
-    ]
+    gpu = None if device == "cpu" else wp.get_device(device).ordinal
+    settings = _providers(ort.get_available_providers(), gpu, precision)
     try:
         session = ort.InferenceSession(str(model), options, providers=settings)
     except Exception as error:  # ONNX Runtime has a family of exceptions of its own, not all of them public

@@ -43,6 +43,7 @@ class DetectionProcessor(Processor):
             context.detector,
             device=context.device,
             threads=context.inference_threads,
+            precision=context.precision,
             score_threshold=config.score_threshold,
             capacity=context.capacity,
         )

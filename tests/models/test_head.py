@@ -7,7 +7,7 @@ import warp as wp
 from warploom.errors import ModelError
 from warploom.models.classes import CLASSES, VEHICLE
 from warploom.models.geometry import KittiCalibration, points_in_boxes
-from warploom.models.head import DetectionHead
+from warploom.models.head import PRECISIONS, DetectionHead, _providers
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +120,24 @@ def test_wrong_arguments_are_refused(head):
         DetectionHead("no_such_card.yaml")
     with pytest.raises(ValueError, match="points must have shape"):
         head.detect_points(np.zeros((3, 2), np.float32), 1.7)
+
+
+def test_a_network_on_a_gpu_computes_in_the_precision_that_was_asked_for(caplog):
+    cuda, both = ["CUDAExecutionProvider", "CPUExecutionProvider"], ["TensorrtExecutionProvider"]
+    both += cuda
+    assert _providers(cuda, 1, "fp32") == [
+        ("CUDAExecutionProvider", {"device_id": 1, "use_tf32": 0}), "CPUExecutionProvider",
+    ]  # fmt: skip
+    assert _providers(both, 0, "tf32")[0] == ("CUDAExecutionProvider", {"device_id": 0, "use_tf32": 1})
+    assert _providers(both, 0, "fp16")[0] == ("TensorrtExecutionProvider", {"device_id": 0, "trt_fp16_enable": True})
+    assert not caplog.records
+    assert _providers(cuda, 0, "fp16")[0][1]["use_tf32"] == 1
+    assert "TensorRT" in caplog.text
+    for precision in PRECISIONS:
+        assert _providers(["CPUExecutionProvider"], 0, precision) == ["CPUExecutionProvider"]
+        assert _providers(both, None, precision) == ["CPUExecutionProvider"]
+
+
+def test_a_precision_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="precision must be one of fp32, tf32, fp16, not 'int4'"):
+        DetectionHead(precision="int4")
