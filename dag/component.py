@@ -128,6 +128,11 @@ class DataProcessComponent(Component):
         """The input whose versions are those of the triggers; None where time gives them."""
         return self.trigger_inputs[0] if self.trigger_inputs else None
 
+    def at_work(self) -> dict[str, int]:
+        """The parts that are at work now, and the versions that they are at work on."""
+        running = self._running
+        return {} if running is None else {"process": running.version}
+
     def process(self, trigger: Trigger) -> Status:
         """Runs for one trigger."""
         raise NotImplementedError
@@ -327,6 +332,10 @@ class DagComponent(DataProcessComponent):
         self._deadline = deadline
         self.in_flight = self._free = in_flight
         self._engine = GraphEngine(self.name, vertices, workers, on_timing)
+
+    def at_work(self) -> dict[str, int]:
+        """The vertices that are at work now, and the versions that they are at work on."""
+        return {} if self._engine is None else self._engine.running()
 
     def start(self) -> None:
         """Starts the workers. After a stop, initialises the processors once more first."""
