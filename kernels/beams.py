@@ -13,6 +13,7 @@ __all__ = [
     "POROSITY",
     "STEP",
     "UNIFORM",
+    "carried_back",
     "first_hit",
     "ray_of",
     "turn_at",
@@ -51,25 +52,34 @@ def uniform(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
 
 
 @wp.func
-def turn_at(pose_in: wp.array(dtype=wp.transform), fraction: float) -> wp.quat:
+def turn_at(pose_in: wp.array(dtype=wp.transform), world: int, fraction: float) -> wp.quat:
     """The sensor's attitude within a sweep: between two near quaternions a chord does for the arc."""
-    start = wp.transform_get_rotation(pose_in[0])
-    return wp.normalize(start + fraction * (wp.transform_get_rotation(pose_in[1]) - start))
+    start = wp.transform_get_rotation(pose_in[2 * world])
+    return wp.normalize(start + fraction * (wp.transform_get_rotation(pose_in[2 * world + 1]) - start))
 
 
 @wp.func
 def ray_of(
     i: int,
+    world: int,
     beams_in: wp.array(dtype=wp.vec3),
     fraction_in: wp.array(dtype=wp.float32),
     pose_in: wp.array(dtype=wp.transform),
 ) -> tuple[wp.vec3, wp.vec3]:
-    """Where a beam starts in the world, and in which direction."""
+    """Where a beam starts in its world, and in which direction."""
     f = fraction_in[i]
-    start = wp.transform_get_translation(pose_in[0])
-    end = wp.transform_get_translation(pose_in[1])
-    turn = turn_at(pose_in, f)
+    start = wp.transform_get_translation(pose_in[2 * world])
+    end = wp.transform_get_translation(pose_in[2 * world + 1])
+    turn = turn_at(pose_in, world, f)
     return start + f * (end - start), wp.normalize(wp.quat_rotate(turn, beams_in[i]))
+
+
+@wp.func
+def carried_back(v: wp.vec3, angle: float) -> wp.vec3:
+    """A vector of an instance's frame that has turned about its z axis by an angle [rad], in the frame unturned."""
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    return wp.vec3(c * v[0] + s * v[1], c * v[1] - s * v[0], v[2])
 
 
 @wp.func
@@ -86,16 +96,23 @@ def first_hit(
     i: int,
     origin: wp.vec3,
     direction: wp.vec3,
+    fraction: float,
     max_range: float,
     seed: wp.uint32,
     scene: wp.uint64,
+    first_item: int,
     mesh_in: wp.array(dtype=wp.uint64),
     first_face_in: wp.array(dtype=wp.int32),
     rows_in: wp.array2d(dtype=wp.vec4),
+    motion_in: wp.array(dtype=wp.vec4),
     label_in: wp.array(dtype=wp.int32),
     material_in: wp.array2d(dtype=wp.float32),
 ) -> tuple[float, int, int, int, wp.vec3]:
-    """The first face that a beam does not pass through: its distance, instance, face, label and normal."""
+    """The first face that a beam does not pass through: its distance, instance, face, label and normal.
+
+    The instances of its world begin at `first_item`; each is where its motion has brought it at the beam's fraction
+    of the sweep.
+    """
     best = max_range
     best_instance = int(NO_HIT)
     best_face = int(NO_HIT)
@@ -106,20 +123,28 @@ def first_hit(
     more = bool(True)
     query = wp.bvh_query_ray(scene, origin, direction)
     while more:
-        r0 = rows_in[item, 0]
-        r1 = rows_in[item, 1]
-        r2 = rows_in[item, 2]
+        at = first_item + item
+        r0 = rows_in[at, 0]
+        r1 = rows_in[at, 1]
+        r2 = rows_in[at, 2]
+        motion = motion_in[at]
+        gone_by = fraction * wp.vec3(motion[0], motion[1], motion[2])
+        turned = fraction * motion[3]
+        start = origin - gone_by
         a0 = wp.vec3(r0[0], r0[1], r0[2])
         a1 = wp.vec3(r1[0], r1[1], r1[2])
         a2 = wp.vec3(r2[0], r2[1], r2[2])
-        local = wp.vec3(wp.dot(a0, origin) + r0[3], wp.dot(a1, origin) + r1[3], wp.dot(a2, origin) + r2[3])
+        local = wp.vec3(wp.dot(a0, start) + r0[3], wp.dot(a1, start) + r1[3], wp.dot(a2, start) + r2[3])
         along = wp.vec3(wp.dot(a0, direction), wp.dot(a1, direction), wp.dot(a2, direction))
-        base = first_face_in[item]
+        if turned != 0.0:
+            local = carried_back(local, turned)
+            along = carried_back(along, turned)
+        base = first_face_in[at]
         gone = float(0.0)
         passes = int(0)
         while passes < MAX_PASSES:
             passes += 1
-            hit = wp.mesh_query_ray(mesh_in[item], local + gone * along, along, best - gone)
+            hit = wp.mesh_query_ray(mesh_in[at], local + gone * along, along, best - gone)
             if not hit.result:
                 break
             t = gone + hit.t
@@ -137,6 +162,8 @@ def first_hit(
                     best_face = hit.face
                     best_label = label
                     n = hit.normal
+                    if turned != 0.0:
+                        n = carried_back(n, -turned)
                     best_normal = world_normal(n, r0, r1, r2)
                 break
         more = wp.bvh_query_next(query, found, best)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .beams import MATERIALS, MAX_PASSES, NO_HIT, POROSITY, STEP, UNIFORM, ray_of, world_normal
+from .beams import MATERIALS, MAX_PASSES, NO_HIT, POROSITY, STEP, UNIFORM, carried_back, ray_of, world_normal
 
 __all__ = ["cast_packets", "hit_packets"]
 
@@ -212,10 +212,11 @@ _MATERIALS = f"""
     const BVH scene = bvh_get(scene_in);
     for (int start = first; start < last; start += WIDTH) {
         Packet world;
-        float best[WIDTH];
+        float best[WIDTH], fraction[WIDTH];
         int item[WIDTH], face[WIDTH];
         for (int k = 0; k < WIDTH; ++k) {
             const int i = start + k < last ? start + k : start;
+            fraction[k] = fraction_in[order_in[i]];
             for (int axis = 0; axis < 3; ++axis) {
                 world.o[axis][k] = origin_in[i][axis];
                 world.d[axis][k] = direction_in[i][axis];
@@ -230,12 +231,30 @@ _MATERIALS = f"""
             int on[WIDTH];
             for (int axis = 0; axis < 3; ++axis)
                 for (int column = 0; column < 4; ++column) row[axis][column] = rows_in.data[3 * number + axis][column];
+            // Of an instance that moves, each ray meets what is there at the ray's own time.
+            const vec4 motion = motion_in[number];
+            const bool moves = motion[0] != 0.0f || motion[1] != 0.0f || motion[2] != 0.0f;
+            float from[3][WIDTH];
+            for (int axis = 0; axis < 3; ++axis)
+                for (int k = 0; k < WIDTH; ++k) from[axis][k] = world.o[axis][k];
+            if (moves)
+                for (int axis = 0; axis < 3; ++axis)
+                    for (int k = 0; k < WIDTH; ++k) from[axis][k] -= fraction[k] * motion[axis];
             for (int axis = 0; axis < 3; ++axis)
                 for (int k = 0; k < WIDTH; ++k) {
-                    p.o[axis][k] = row[axis][0] * world.o[0][k] + row[axis][1] * world.o[1][k]
-                        + row[axis][2] * world.o[2][k] + row[axis][3];
+                    p.o[axis][k] = row[axis][0] * from[0][k] + row[axis][1] * from[1][k]
+                        + row[axis][2] * from[2][k] + row[axis][3];
                     p.d[axis][k] = row[axis][0] * world.d[0][k] + row[axis][1] * world.d[1][k]
                         + row[axis][2] * world.d[2][k];
+                }
+            if (motion[3] != 0.0f)
+                for (int k = 0; k < WIDTH; ++k) {
+                    const float c = cosf(fraction[k] * motion[3]), s = sinf(fraction[k] * motion[3]);
+                    const float ox = p.o[0][k], oy = p.o[1][k], dx = p.d[0][k], dy = p.d[1][k];
+                    p.o[0][k] = c * ox + s * oy;
+                    p.o[1][k] = c * oy - s * ox;
+                    p.d[0][k] = c * dx + s * dy;
+                    p.d[1][k] = c * dy - s * dx;
                 }
             for (int k = 0; k < WIDTH; ++k) {
                 found[k] = best[k];
@@ -293,12 +312,14 @@ def _meet_scene(
     origin_in: wp.array(dtype=wp.vec3),
     direction_in: wp.array(dtype=wp.vec3),
     order_in: wp.array(dtype=wp.int32),
+    fraction_in: wp.array(dtype=wp.float32),
     max_range: float,
     seed: wp.uint32,
     scene_in: wp.uint64,
     mesh_in: wp.array(dtype=wp.uint64),
     first_face_in: wp.array(dtype=wp.int32),
     rows_in: wp.array2d(dtype=wp.vec4),
+    motion_in: wp.array(dtype=wp.vec4),
     label_in: wp.array(dtype=wp.int32),
     material_in: wp.array2d(dtype=wp.float32),
     # out
@@ -354,6 +375,7 @@ def cast_packets(
     mesh_in: wp.array(dtype=wp.uint64),
     first_face_in: wp.array(dtype=wp.int32),
     rows_in: wp.array2d(dtype=wp.vec4),
+    motion_in: wp.array(dtype=wp.vec4),
     label_in: wp.array(dtype=wp.int32),
     material_in: wp.array2d(dtype=wp.float32),
     # out: rays in the world, in that order
@@ -372,12 +394,12 @@ def cast_packets(
         first = block * _BLOCK
         last = wp.min(first + _BLOCK, n)
         for k in range(first, last):
-            origin, direction = ray_of(order_in[k], beams_in, fraction_in, pose_in)
+            origin, direction = ray_of(order_in[k], 0, beams_in, fraction_in, pose_in)
             origin_out[k] = origin
             direction_out[k] = direction
         _meet_scene(
-            first, last, origin_out, direction_out, order_in, max_range, seed_in[0], scene_in[0], mesh_in,
-            first_face_in, rows_in, label_in, material_in, distance_out, instance_out, face_out,
+            first, last, origin_out, direction_out, order_in, fraction_in, max_range, seed_in[0], scene_in[0],
+            mesh_in, first_face_in, rows_in, motion_in, label_in, material_in, distance_out, instance_out, face_out,
         )  # fmt: skip
         for k in range(first, last):
             i = order_in[k]
@@ -388,6 +410,9 @@ def cast_packets(
             if face >= 0:
                 label = label_in[first_face_in[item] + face]
                 normal = wp.mesh_eval_face_normal(mesh_in[item], face)
+                turned = fraction_in[i] * motion_in[item][3]
+                if turned != 0.0:
+                    normal = carried_back(normal, -turned)
                 normal = world_normal(normal, rows_in[item, 0], rows_in[item, 1], rows_in[item, 2])
             else:
                 distance_out[i] = 0.0

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .beams import MATERIALS, NO_HIT, first_hit, ray_of, turn_at, uniform
+from .beams import MATERIALS, NO_HIT, first_hit, ray_of
 from .device import DEFAULT_DEVICE
+from .echoes import ECHO_BLOCK, compact_echoes, make_echoes
 from .interop import borrow, family_of, give
 from .meshes import MeshSet
 from .ray_packets import cast_packets, hit_packets
@@ -26,11 +27,11 @@ from .threads import launch_parts, run_together, thread_count
 
 __all__ = ["MATERIALS", "LidarCast", "RayHits", "raycast"]
 
-_MATERIAL_MASK = wp.constant(MATERIALS - 1)
-_CLASS_SHIFT = wp.constant(8)
-_REFLECTIVITY, _POROSITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in range(5))
 _NOWHERE = 1.0e9  # [m]
-_BLOCK = wp.constant(256)  # beams of a part's turn
+_BLOCK = int(ECHO_BLOCK)
+# Of rain of 1 mm/h: what it takes of a signal both ways [1/m] (Goodin et al. 2019), and the share of beams that a drop
+# sends back, a metre [1/m]: a judgement, 2 % of the beams within the first ten metres at 10 mm/h.
+_RAIN_LOSS, _RAIN_ECHOES, _MOST_ECHOES = 0.02, 5.0e-4, 0.02
 
 
 def _launch_in_parts(kernel: wp.Kernel, parts: int, n: int, device: str, inputs: list, outputs: list) -> None:
@@ -38,20 +39,12 @@ def _launch_in_parts(kernel: wp.Kernel, parts: int, n: int, device: str, inputs:
     if parts == 1 or wp.get_device(device).is_capturing:
         wp.launch(kernel, n, inputs=[0, 1, *inputs], outputs=outputs, device=device)
         return
-    dim = -(-n // (int(_BLOCK) * parts)) * int(_BLOCK)
+    dim = -(-n // (_BLOCK * parts)) * _BLOCK
     launches = [
         wp.launch(kernel, dim, inputs=[part, parts, *inputs], outputs=outputs, device=device, record_cmd=True)
         for part in range(parts)
     ]
     run_together([launch.launch for launch in launches])
-
-
-@wp.func
-def _gauss(seed: wp.uint32, a: wp.uint32, b: wp.uint32) -> float:
-    """A nearly normal number, within ± 3.5: the sum of four uniform ones, which needs no logarithm and no cosine."""
-    u = uniform(seed, a, b) + uniform(seed + wp.uint32(1), a, b)
-    v = uniform(seed + wp.uint32(2), a, b) + uniform(seed + wp.uint32(3), a, b)
-    return (u + v - 2.0) * 1.7320508
 
 
 @wp.kernel
@@ -62,11 +55,13 @@ def _cast(
     pose_in: wp.array(dtype=wp.transform),
     max_range: float,
     seed_in: wp.array(dtype=wp.uint32),
-    # in: scene
+    # in: scenes
+    max_instances: int,
     scene_in: wp.array(dtype=wp.uint64),
     mesh_in: wp.array(dtype=wp.uint64),
     first_face_in: wp.array(dtype=wp.int32),
     rows_in: wp.array2d(dtype=wp.vec4),
+    motion_in: wp.array(dtype=wp.vec4),
     label_in: wp.array(dtype=wp.int32),
     material_in: wp.array2d(dtype=wp.float32),
     # out
@@ -76,115 +71,21 @@ def _cast(
     hit_label_out: wp.array(dtype=wp.int32),
     normal_out: wp.array(dtype=wp.vec3),
 ):
-    """Finds the first face that each beam does not pass through."""
-    i = wp.tid()
-    origin, direction = ray_of(i, beams_in, fraction_in, pose_in)
+    """Finds the first face that each beam does not pass through; the beams of one world after those of another."""
+    k = wp.tid()
+    n = beams_in.shape[0]
+    world = k // n
+    i = k - world * n
+    origin, direction = ray_of(i, world, beams_in, fraction_in, pose_in)
     distance, instance, face, label, normal = first_hit(
-        i, origin, direction, max_range, seed_in[0], scene_in[0], mesh_in, first_face_in, rows_in, label_in,
-        material_in,
+        i, origin, direction, fraction_in[i], max_range, seed_in[world], scene_in[world], world * max_instances,
+        mesh_in, first_face_in, rows_in, motion_in, label_in, material_in,
     )  # fmt: skip
-    distance_out[i] = distance
-    instance_out[i] = instance
-    face_out[i] = face
-    hit_label_out[i] = label
-    normal_out[i] = normal
-
-
-@wp.kernel
-def _sense(
-    part: int,
-    parts: int,
-    # in: hits
-    beams_in: wp.array(dtype=wp.vec3),
-    fraction_in: wp.array(dtype=wp.float32),
-    pose_in: wp.array(dtype=wp.transform),
-    distance_in: wp.array(dtype=wp.float32),
-    hit_label_in: wp.array(dtype=wp.int32),
-    normal_in: wp.array(dtype=wp.vec3),
-    material_in: wp.array2d(dtype=wp.float32),
-    seed_in: wp.array(dtype=wp.uint32),
-    # in: sensor
-    min_range: float,
-    reach: float,
-    range_noise: float,
-    drop_out: float,
-    # out
-    kept_out: wp.array(dtype=wp.int32),
-    range_out: wp.array(dtype=wp.float32),
-    intensity_out: wp.array(dtype=wp.float32),
-):
-    """Makes an echo of each hit: its noisy range and its intensity, or none where it is too weak."""
-    i = (wp.tid() // _BLOCK * parts + part) * _BLOCK + wp.tid() % _BLOCK
-    if i >= beams_in.shape[0]:
-        return
-    kept_out[i] = 0
-    d = distance_in[i]
-    if d < min_range or hit_label_in[i] < 0:
-        return
-    turn = turn_at(pose_in, fraction_in[i])
-    cosine = wp.abs(wp.dot(wp.quat_rotate(turn, beams_in[i]), normal_in[i]))
-    material = hit_label_in[i] & _MATERIAL_MASK
-    seed = seed_in[0] ^ wp.uint32(0x5BD1E995)
-    k = wp.uint32(i)
-    reflectivity = material_in[material, _REFLECTIVITY]
-    gloss = material_in[material, _GLOSS]
-    # Rough surfaces send back more at a grazing angle than Lambert's law says; glossy paint has a lobe as well.
-    texture = 1.0 + 0.2 * _gauss(seed, k, wp.uint32(1))
-    root = wp.sqrt(cosine)
-    slant = root * wp.sqrt(root)
-    square = cosine * cosine
-    lobe = gloss * square * square * square * square
-    echo = reflectivity * texture * ((1.0 - gloss) * slant + lobe)
-    # The signal falls with the square of the range: it is 1 at `reach` for a tenth of full reflectivity, face on,
-    # and there half of the echoes are seen.
-    signal = echo / (d * d) * (reach * reach) * 10.0
-    cube = signal * signal * signal
-    seen = cube / (1.0 + cube)
-    chance = uniform(seed, k, wp.uint32(3))
-    if chance > seen * (1.0 - drop_out) * (1.0 - material_in[material, _LOSS]):
-        return
-    kept_out[i] = 1
-    roughness = material_in[material, _ROUGHNESS]
-    spread = wp.sqrt(range_noise * range_noise + roughness * roughness)
-    range_out[i] = wp.max(d + spread * _gauss(seed, k, wp.uint32(7)), min_range)
-    # What is reported is compensated for range and in part for the angle, as sensors do.
-    reported = reflectivity * texture * ((1.0 - gloss) * (0.5 + 0.5 * cosine) + lobe)
-    intensity_out[i] = wp.clamp(reported, 0.0, 1.0)
-
-
-@wp.kernel
-def _compact(
-    # in
-    beams_in: wp.array(dtype=wp.vec3),
-    kept_in: wp.array(dtype=wp.int32),
-    rank_in: wp.array(dtype=wp.int32),
-    range_in: wp.array(dtype=wp.float32),
-    intensity_in: wp.array(dtype=wp.float32),
-    hit_label_in: wp.array(dtype=wp.int32),
-    hit_instance_in: wp.array(dtype=wp.int32),
-    beam_ring_in: wp.array(dtype=wp.uint16),
-    beam_time_in: wp.array(dtype=wp.float32),
-    # out
-    points_out: wp.array(dtype=wp.vec4),
-    ring_out: wp.array(dtype=wp.uint16),
-    t_out: wp.array(dtype=wp.float32),
-    point_class_out: wp.array(dtype=wp.int32),
-    instance_out: wp.array(dtype=wp.int32),
-    count_out: wp.array(dtype=wp.int32),
-):
-    """Writes the echoes one after the other, in the order of the beams."""
-    i = wp.tid()
-    if i == kept_in.shape[0] - 1:
-        count_out[0] = rank_in[i] + kept_in[i]
-    if kept_in[i] == 0:
-        return
-    k = rank_in[i]
-    p = range_in[i] * beams_in[i]
-    points_out[k] = wp.vec4(p[0], p[1], p[2], intensity_in[i])
-    ring_out[k] = beam_ring_in[i]
-    t_out[k] = beam_time_in[i]
-    point_class_out[k] = hit_label_in[i] >> _CLASS_SHIFT
-    instance_out[k] = hit_instance_in[i]
+    distance_out[k] = distance
+    instance_out[k] = instance
+    face_out[k] = face
+    hit_label_out[k] = label
+    normal_out[k] = normal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +93,8 @@ class LidarCast:
     """A plan: casts the beams of one LiDAR sweep into a scene and makes points of the echoes.
 
     `place` takes the scene of the next sweeps from the host; `launch` allocates nothing and reads nothing back.
+    A plan of several `worlds` casts the same sensor's beams into each of them in one launch. What is documented as of
+    shape (n,) then has worlds × n rows, those of world w from w × n on; `count` has one number a world.
     """
 
     meshes: MeshSet
@@ -204,6 +107,8 @@ class LidarCast:
     """Time of each beam after the start of the sweep [s], NumPy, shape (n,)."""
     period: float = 0.1
     """Duration of a sweep [s]."""
+    worlds: int = 1
+    """Scenes that one launch casts into."""
     max_instances: int = 4096
     """Instances that a scene can have."""
     min_range: float = 0.9
@@ -216,6 +121,13 @@ class LidarCast:
     """Standard deviation of a range [m]."""
     drop_out: float = 0.01
     """Share of the echoes that are lost for no reason."""
+    edge_share: float = 0.0
+    """Share of the beams whose footprint reaches the next beam's surface: divergence over azimuth step, 0 to 1. The
+    beam before and the one after, of the same ring, are its neighbours."""
+    pulse: float = 1.0
+    """Surfaces that are nearer to each other along a beam give one echo [m]."""
+    noise_label: int = 0
+    """Label of echoes that are of no face, as those of drops of rain."""
     method: str = "auto"
     """`packets` (eight rays at once, for a CPU), `single` (one a thread), or `auto`: `packets` on a CPU, else
     `single`."""
@@ -227,6 +139,10 @@ class LidarCast:
                 f"beams, ring and time must have one length > 0, not {n}, {len(self.ring)}, {len(self.time)}"
             )
 
+        if self.worlds < 1:
+            raise ValueError(f"worlds must be at least 1, not {self.worlds}")
+        if not 0 <= self.edge_share <= 1:
+            raise ValueError(f"edge_share must be 0 to 1, not {self.edge_share}")
         if self.method not in ("auto", "packets", "single"):
             raise ValueError(f"method must be 'auto', 'packets' or 'single', not {self.method!r}")
         if self.method == "packets" and device != DEFAULT_DEVICE:
@@ -243,26 +159,30 @@ class LidarCast:
         hold("_ring", upload(self.ring, wp.uint16, np.uint16))
         hold("_time", upload(time, wp.float32, np.float32))
         hold("_fraction", upload(time / self.period, wp.float32, np.float32))
-        hold("_pose", wp.zeros(2, dtype=wp.transform, device=device))
-        hold("_seed", wp.zeros(1, dtype=wp.uint32, device=device))
+        worlds, rooms = self.worlds, self.worlds * self.max_instances
+        hold("_pose", wp.zeros(2 * worlds, dtype=wp.transform, device=device))
+        hold("_seed", wp.zeros(worlds, dtype=wp.uint32, device=device))
+        hold("_rain", wp.zeros(worlds, dtype=wp.vec2, device=device))
         hold("_material", wp.zeros((MATERIALS, 5), dtype=wp.float32, device=device))
-        hold("_scene", [])
-        hold("_scene_id", wp.zeros(1, dtype=wp.uint64, device=device))
-        hold("_mesh", wp.zeros(self.max_instances, dtype=wp.uint64, device=device))
-        hold("_first_face", wp.zeros(self.max_instances, dtype=wp.int32, device=device))
-        hold("_rows", wp.zeros((self.max_instances, 3), dtype=wp.vec4, device=device))
+        hold("_scene", [None] * worlds)
+        hold("_scene_id", wp.zeros(worlds, dtype=wp.uint64, device=device))
+        hold("_mesh", wp.zeros(rooms, dtype=wp.uint64, device=device))
+        hold("_first_face", wp.zeros(rooms, dtype=wp.int32, device=device))
+        hold("_rows", wp.zeros((rooms, 3), dtype=wp.vec4, device=device))
+        hold("_motion", wp.zeros(rooms, dtype=wp.vec4, device=device))
         for name, dtype in (
             ("distance", wp.float32), ("hit_instance", wp.int32), ("hit_face", wp.int32), ("hit_label", wp.int32),
             ("hit_normal", wp.vec3), ("_kept", wp.int32), ("_rank", wp.int32), ("_range", wp.float32),
-            ("_intensity", wp.float32), ("points", wp.vec4), ("point_ring", wp.uint16), ("point_time", wp.float32),
-            ("point_class", wp.int32), ("point_instance", wp.int32),
+            ("_intensity", wp.float32), ("_label", wp.int32), ("_instance", wp.int32), ("points", wp.vec4),
+            ("point_ring", wp.uint16), ("point_time", wp.float32), ("point_class", wp.int32),
+            ("point_instance", wp.int32),
         ):  # fmt: skip
-            hold(name, wp.zeros(n, dtype=dtype, device=device))
-        hold("count", wp.zeros(1, dtype=wp.int32, device=device))
+            hold(name, wp.zeros(worlds * n, dtype=dtype, device=device))
+        hold("count", wp.zeros(worlds, dtype=wp.int32, device=device))
         hold("_parts", 1)
         hold("_packets", device == DEFAULT_DEVICE and self.method != "single")
         if self._packets:
-            hold("_parts", min(thread_count(), -(-n // int(_BLOCK))))
+            hold("_parts", min(thread_count(), -(-n // _BLOCK)))
             hold("_order", upload(_order_of(self.beams), wp.int32, np.int32))
             hold("_ray_origin", wp.zeros(n, dtype=wp.vec3, device=device))
             hold("_ray_direction", wp.zeros(n, dtype=wp.vec3, device=device))
@@ -277,17 +197,22 @@ class LidarCast:
             raise ValueError(f"table must have shape ({MATERIALS}, 5), not {np.shape(table)}")
         self._material.assign(np.ascontiguousarray(table, np.float32))
 
-    def place(self, mesh: np.ndarray, transforms: np.ndarray) -> None:
+    def place(
+        self, mesh: np.ndarray, transforms: np.ndarray, motion: np.ndarray | None = None, *, world: int = 0
+    ) -> None:
         """Sets the instances of the scene.
 
         Each beam tries the first instance first, so let that be the ground, which most beams hit.
 
         Args:
             mesh: Number of each instance's mesh in `meshes`, shape (k,).
-            transforms: World from local, affine, shape (k, 4, 4).
+            transforms: World from local at the start of the sweep, affine, shape (k, 4, 4).
+            motion: How far each instance goes along x, y, z [m] during the sweep, and by which angle it turns about
+                its own z axis [rad], shape (k, 4); None: all stand still. One that turns is scaled evenly in plan.
+            world: Which scene of a plan of several.
 
         Raises:
-            ValueError: There are none, or more than `max_instances`.
+            ValueError: There are none, or more than `max_instances`, or no such world.
         """
         k = len(mesh)
         if not 0 < k <= self.max_instances or np.shape(transforms) != (k, 4, 4):
@@ -295,27 +220,40 @@ class LidarCast:
                 f"mesh must name 1 to {self.max_instances} instances and transforms be (k, 4, 4), "
                 f"not {k} and {np.shape(transforms)}"
             )
+        if motion is not None and np.shape(motion) != (k, 4):
+            raise ValueError(f"motion must have shape ({k}, 4), not {np.shape(motion)}")
+        self._check_world(world)
         device = self.meshes.device
-        host = self.meshes.instances(np.asarray(mesh), np.asarray(transforms, np.float64))
+        host = self.meshes.instances(np.asarray(mesh), np.asarray(transforms, np.float64), motion)
         # The first instance is tried before the tree is searched, so it is not in the tree.
         bounds = [host["lower"][1:], host["upper"][1:]]
         if k == 1:  # a tree needs something to hold: a point that no beam comes near
             bounds = [np.full((1, 3), _NOWHERE, np.float32)] * 2
         lower, upper = (wp.array(corners, dtype=wp.vec3, device=device) for corners in bounds)
-        self._scene[:] = [wp.Bvh(lower, upper), lower, upper]
-        self._scene_id.assign(np.array([self._scene[0].id], np.uint64))
-        wp.copy(self._mesh, wp.array(host["mesh"], dtype=wp.uint64, device=device), count=k)
-        wp.copy(self._first_face, wp.array(host["first_face"], dtype=wp.int32, device=device), count=k)
-        wp.copy(self._rows, wp.array(host["rows"].reshape(k, 3, 4), dtype=wp.vec4, device=device), count=3 * k)
+        self._scene[world] = [wp.Bvh(lower, upper), lower, upper]
+        self._scene_id[world : world + 1].assign(np.array([self._scene[world][0].id], np.uint64))
+        first = world * self.max_instances
+        for room, name, dtype in (
+            (self._mesh, "mesh", wp.uint64), (self._first_face, "first_face", wp.int32),
+            (self._motion, "motion", wp.vec4),
+        ):  # fmt: skip
+            wp.copy(room, wp.array(host[name], dtype=dtype, device=device), dest_offset=first, count=k)
+        rows = wp.array(host["rows"].reshape(k, 3, 4), dtype=wp.vec4, device=device)
+        wp.copy(self._rows, rows, dest_offset=3 * first, count=3 * k)
 
-    def aim(self, start: np.ndarray, end: np.ndarray | None = None, seed: int = 0) -> None:
+    def aim(self, start: np.ndarray, end: np.ndarray | None = None, seed: int = 0, *, world: int = 0) -> None:
         """Sets the sensor's pose at start and end of the sweep, and the seed of its noise.
 
         Args:
             start: World from sensor, rigid, shape (4, 4).
             end: The same one period later; None for a sensor at rest.
             seed: Any integer.
+            world: Which scene of a plan of several.
+
+        Raises:
+            ValueError: There is no such world.
         """
+        self._check_world(world)
         rows: list[np.ndarray] = []
         for pose in (start, start if end is None else end):
             quaternion = wp.quat_from_matrix(wp.mat33(*np.asarray(pose, np.float64)[:3, :3].ravel()))
@@ -323,38 +261,80 @@ class LidarCast:
             if rows and np.dot(rows[0][3:], row[3:]) < 0:
                 row[3:] *= -1.0  # the same attitude, on the near side
             rows.append(row)
-        self._pose.assign(np.array(rows, np.float32))
-        self._seed.assign(np.array([seed & 0xFFFFFFFF], np.uint32))
+        self._pose[2 * world : 2 * world + 2].assign(np.array(rows, np.float32))
+        self._seed[world : world + 1].assign(np.array([seed & 0xFFFFFFFF], np.uint32))
 
-    def launch(self) -> None:
-        """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`."""
-        device, n = self.meshes.device, self._beams.shape[0]
-        beams = [self._beams, self._fraction, self._pose, self.max_range, self._seed]
-        scene = [self._scene_id, self._mesh, self._first_face, self._rows, self.meshes.labels, self._material]
-        hits = [self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal]
+    def set_rain(self, rate: float, *, world: int = 0) -> None:
+        """Sets how hard it rains in a world [mm/h]; 0 is dry.
+
+        Raises:
+            ValueError: A rate that is negative or not finite, or no such world.
+        """
+        self._check_world(world)
+        if not 0 <= rate < np.inf:
+            raise ValueError(f"rate must be a number of mm/h from 0, not {rate}")
+        density = rate**0.6
+        row = [_RAIN_LOSS * density, min(_RAIN_ECHOES * density, _MOST_ECHOES)]
+        self._rain[world : world + 1].assign(np.array([row], np.float32))
+
+    def _check_world(self, world: int) -> None:
+        if not 0 <= world < self.worlds:
+            raise ValueError(f"world must be 0 to {self.worlds - 1}, not {world}")
+
+    def cast(self) -> None:
+        """Finds what each beam hits: fills `distance`, `hit_instance`, `hit_face`, `hit_label` and `hit_normal`."""
+        n = self._beams.shape[0]
         if self._packets:
             rays = [self._ray_origin, self._ray_direction]
-            launch_parts(cast_packets, self._parts, [self._order, *beams, *scene], [*rays, *hits])
-        else:
-            wp.launch(_cast, n, inputs=[*beams, *scene], outputs=hits, device=device)
+            for world in range(self.worlds):
+                rooms = slice(world * self.max_instances, (world + 1) * self.max_instances)
+                here, own = slice(world, world + 1), slice(world * n, (world + 1) * n)
+                inputs = [
+                    self._order, self._beams, self._fraction, self._pose[2 * world : 2 * world + 2], self.max_range,
+                    self._seed[here], self._scene_id[here], self._mesh[rooms], self._first_face[rooms],
+                    self._rows[rooms], self._motion[rooms], self.meshes.labels, self._material,
+                ]  # fmt: skip
+                hits = [self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal]
+                launch_parts(cast_packets, self._parts, inputs, [*rays, *(array[own] for array in hits)])
+            return
+        wp.launch(
+            _cast,
+            self.worlds * n,
+            inputs=[
+                self._beams, self._fraction, self._pose, self.max_range, self._seed, self.max_instances,
+                self._scene_id, self._mesh, self._first_face, self._rows, self._motion, self.meshes.labels,
+                self._material,
+            ],
+            outputs=[self.distance, self.hit_instance, self.hit_face, self.hit_label, self.hit_normal],
+            device=self.meshes.device,
+        )  # fmt: skip
+
+    def launch(self) -> None:
+        """Casts all beams; fills `points` (x y z in the sensor's frame, intensity) and its siblings, and `count`.
+
+        A point is where its beam met the thing, in the sensor's frame of that moment.
+        """
+        device, n = self.meshes.device, self.worlds * self._beams.shape[0]
+        self.cast()
         _launch_in_parts(
-            _sense,
+            make_echoes,
             self._parts,
             n,
             device,
             [
-                self._beams, self._fraction, self._pose, self.distance, self.hit_label, self.hit_normal,
-                self._material, self._seed, self.min_range, self.reach, self.range_noise, self.drop_out,
+                self._beams, self._fraction, self._ring, self._pose, self.distance, self.hit_label, self.hit_instance,
+                self.hit_normal, self._material, self._seed, self._rain, self.min_range, self.max_range, self.reach,
+                self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
             ],
-            [self._kept, self._range, self._intensity],
+            [self._kept, self._range, self._intensity, self._label, self._instance],
         )  # fmt: skip
         wp.utils.array_scan(self._kept, self._rank, inclusive=False)
         wp.launch(
-            _compact,
+            compact_echoes,
             dim=n,
             inputs=[
-                self._beams, self._kept, self._rank, self._range, self._intensity, self.hit_label,
-                self.hit_instance, self._ring, self._time,
+                self._beams, self._kept, self._rank, self._range, self._intensity, self._label, self._instance,
+                self._ring, self._time,
             ],
             outputs=[
                 self.points, self.point_ring, self.point_time, self.point_class, self.point_instance, self.count,
@@ -448,7 +428,7 @@ def raycast(vertices: Any, faces: Any, origins: Any, directions: Any, *, max_dis
         inputs = [mesh.id, starts.view(wp.vec3).flatten(), along.view(wp.vec3).flatten(), float(max_distance)]
         outputs = [distance, face, normal]
         if str(device) == DEFAULT_DEVICE:
-            launch_parts(hit_packets, min(thread_count(), -(-n // int(_BLOCK))), inputs, outputs)
+            launch_parts(hit_packets, min(thread_count(), -(-n // _BLOCK)), inputs, outputs)
         else:
             wp.launch(_first_hit, n, inputs=inputs, outputs=outputs, device=device)
     hits = RayHits(give(distance, family), give(face, family), give(normal, family))

@@ -124,7 +124,8 @@ def test_length_of_a_direction_does_not_matter(seed, length):
     one = raycast(vertices, faces, origins, directions)
     other = raycast(vertices, faces, origins, directions * np.float32(length))
     hit = np.isfinite(one.distance) & np.isfinite(other.distance)
-    assert np.isclose(one.distance[hit], other.distance[hit], atol=DISTANCE_TOLERANCE).mean() > 0.99
+    close = np.isclose(one.distance[hit], other.distance[hit], atol=DISTANCE_TOLERANCE)
+    assert close.sum() >= 0.99 * hit.sum()
     assert (np.isfinite(one.distance) == np.isfinite(other.distance)).mean() > 0.99
 
 
@@ -330,6 +331,93 @@ def test_a_moving_sensor_shears_the_sweep():
     cast.aim(np.eye(4), end)
     cast.launch()
     assert np.allclose(cast.distance.numpy(), np.linspace(50, 49, 11), atol=1e-3)
+
+
+def placed_at(transform, motion, fraction):
+    """World from local of an instance that has gone and turned a fraction of its way."""
+    c, s = np.cos(fraction * motion[3]), np.sin(fraction * motion[3])
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    placed = transform @ turn
+    placed[:3, 3] += fraction * np.asarray(motion[:3])
+    return placed
+
+
+@pytest.mark.parametrize("method", ["packets", "single"])
+def test_each_beam_meets_moving_things_where_they_are_at_its_time(method):
+    """Against a scene at rest for each of eleven times: equal but for beams that graze an edge, 1 %."""
+    random = np.random.default_rng(21)
+    meshes = MeshSet("cpu", max_faces=1000)
+    for seed in (1, 2):
+        vertices, faces, _, _ = soup(seed, faces=40)
+        meshes.add(vertices * 0.3, faces, np.full(len(faces), PLAIN))
+    which = random.integers(0, 2, 9)
+    transforms = np.tile(np.eye(4), (9, 1, 1))
+    transforms[:, :3, 3] = random.normal(0, 8, (9, 3))
+    motion = random.normal(0, [1.0, 1.0, 0.3, 0.4], (9, 4))
+    motion[:3] = 0.0  # of those at rest too
+    motion[3, 3] = 0.0
+    fan = beams(300)
+    directions = np.tile(fan, (11, 1))
+    fraction = np.repeat(np.linspace(0, 1, 11), len(fan))
+    cast = LidarCast(meshes=meshes, beams=directions, ring=np.zeros(len(directions)), time=0.1 * fraction,
+                     max_range=500.0, min_range=0.01, method=method)  # fmt: skip
+    cast.set_materials(materials())
+    cast.place(which, transforms, motion)
+    cast.aim(np.eye(4))
+    cast.launch()
+    same, hits = 0, 0
+    for k, f in enumerate(np.linspace(0, 1, 11)):
+        still = LidarCast(meshes=meshes, beams=fan, ring=np.zeros(len(fan)), time=np.zeros(len(fan)),
+                          max_range=500.0, min_range=0.01, method=method)  # fmt: skip
+        still.set_materials(materials())
+        still.place(which, np.array([placed_at(t, m, f) for t, m in zip(transforms, motion, strict=True)]))
+        still.aim(np.eye(4))
+        still.launch()
+        own = slice(k * len(fan), (k + 1) * len(fan))
+        agree = np.abs(cast.distance.numpy()[own] - still.distance.numpy()) < 5e-3
+        agree &= cast.hit_instance.numpy()[own] == still.hit_instance.numpy()
+        seen = still.hit_instance.numpy() >= 0
+        assert np.allclose(cast.hit_normal.numpy()[own][agree], still.hit_normal.numpy()[agree], atol=1e-2)
+        same, hits = same + agree.sum(), hits + seen.sum()
+    assert same >= 0.99 * len(directions)
+    assert hits > 300
+
+
+@pytest.mark.parametrize("method", ["packets", "single"])
+def test_several_worlds_in_one_launch_are_what_each_is_alone(method):
+    random = np.random.default_rng(22)
+    meshes = MeshSet("cpu", max_faces=1000)
+    for seed in (1, 2, 3):
+        vertices, faces, _, _ = soup(seed, faces=60)
+        meshes.add(vertices * 0.4, faces, np.full(len(faces), (PLAIN, HALF, PLAIN)[seed - 1] + 256 * seed))
+    directions = beams(1500)
+    options = {"range_noise": 0.02, "drop_out": 0.1, "method": method, "max_instances": 16, "edge_share": 0.5}
+    together = caster(meshes, directions, worlds=3, **options)
+    alone = [caster(meshes, directions, **options) for _ in range(3)]
+    for w, one in enumerate(alone):
+        k = 5 + 3 * w
+        which, transforms = random.integers(0, 3, k), affine(random, k)
+        motion = random.normal(0, 0.5, (k, 4)) * (random.random((k, 1)) < 0.5)
+        end = np.eye(4)
+        end[0, 3] = 0.3 * w
+        for cast, world in ((together, w), (one, 0)):
+            cast.place(which, transforms, motion, world=world)
+            cast.aim(np.eye(4), end, seed=70 + w, world=world)
+            cast.set_rain(5.0 * w, world=world)
+        one.launch()
+    together.launch()
+    n = len(directions)
+    for w, one in enumerate(alone):
+        count = one.count.numpy()[0]
+        assert together.count.numpy()[w] == count > 100
+        for name in ("points", "point_ring", "point_time", "point_class", "point_instance"):
+            got = getattr(together, name).numpy()[w * n : w * n + count]
+            assert got.tobytes() == getattr(one, name).numpy()[:count].tobytes(), name
+    with pytest.raises(ValueError, match="world must be 0 to 2, not 3"):
+        together.aim(np.eye(4), world=3)
+    with pytest.raises(ValueError, match="worlds must be at least 1"):
+        caster(meshes, directions, worlds=0)
 
 
 def test_noise_has_the_spread_asked_for_and_far_dark_echoes_are_lost():

@@ -1,0 +1,107 @@
+"""Echoes: edges that mix, rain that takes and adds; ranges of the hits themselves are tested with the ray caster."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from warploom.kernels.meshes import MeshSet
+from warploom.kernels.raycast import MATERIALS, LidarCast
+
+PLAIN, NOISE = 1, 256 * 9
+
+
+def wall(x, low, high):
+    return np.array([[x, low, -90], [x, high, -90], [x, high, 90], [x, low, 90]], np.float32)
+
+
+def sweep(walls, directions, *, ring=None, rain=0.0, seed=1, **options):
+    """One sweep at walls facing the sensor; returns the plan."""
+    meshes = MeshSet("cpu", max_faces=1000)
+    for corners in walls:
+        meshes.add(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, PLAIN))
+    n = len(directions)
+    settings = {"range_noise": 0.0, "drop_out": 0.0, "min_range": 0.5, "reach": 1e4, "max_range": 120.0} | options
+    cast = LidarCast(meshes=meshes, beams=directions, ring=np.zeros(n) if ring is None else ring, time=np.zeros(n),
+                     noise_label=NOISE, **settings)  # fmt: skip
+    table = np.zeros((MATERIALS, 5), np.float32)
+    table[PLAIN, 0] = 1.0
+    cast.set_materials(table)
+    cast.place(np.arange(len(walls)), np.tile(np.eye(4), (len(walls), 1, 1)))
+    cast.aim(np.eye(4), seed=seed)
+    cast.set_rain(rain)
+    cast.launch()
+    return cast
+
+
+def fan(n=4001, half=0.6):
+    azimuth = np.linspace(-half, half, n)
+    return np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1).astype(np.float32)
+
+
+def depth(cast):
+    """x of each point: the walls stand across it."""
+    return cast.points.numpy()[: cast.count.numpy()[0], 0]
+
+
+def edges(count, gap):
+    """Pairs of beams on a near wall with slits, through which the far wall is seen."""
+    at = np.linspace(-4, 4, count + 1)
+    near = [wall(8.0, a, 0.5 * (a + b)) for a, b in itertools.pairwise(at)]
+    return [wall(8.0 + gap, -90, 90), *near]
+
+
+def test_a_footprint_over_an_edge_gives_an_echo_in_between():
+    walls = edges(150, gap=0.5)
+    x = depth(sweep(walls, fan(), edge_share=0.6))
+    between = (x > 8.01) & (x < 8.49)
+    # 300 edges, each with a beam on either side whose footprint reaches over it in half of 0.6 of the cases.
+    assert 300 * 0.6 * 0.6 < between.sum() < 300 * 0.6 * 1.4
+    assert not ((depth(sweep(walls, fan())) > 8.01) & (depth(sweep(walls, fan())) < 8.49)).any()
+    # No echo lies outside of the two surfaces.
+    assert x.min() > 8 - 5e-3  # a neighbour on the same wall is a little nearer or farther
+    assert x.max() < 8.5 + 5e-3
+
+
+def test_surfaces_farther_apart_than_the_pulse_give_echoes_of_their_own():
+    x = depth(sweep(edges(150, gap=3.0), fan(), edge_share=1.0, pulse=1.0))
+    assert ((np.abs(x - 8) < 5e-3) | (np.abs(x - 11) < 5e-3)).all()
+
+
+def test_beams_of_other_rings_do_not_mix():
+    x = depth(sweep(edges(150, gap=0.5), fan(), ring=np.arange(4001) % 2, edge_share=1.0))
+    assert ((np.abs(x - 8) < 1e-3) | (np.abs(x - 8.5) < 1e-3)).all()
+
+
+def test_rain_takes_far_echoes_and_adds_near_ones():
+    directions = np.tile(np.array([[1.0, 0, 0]], np.float32), (200_000, 1))
+    far = [wall(30.0, -90, 90)]
+    reach = 30.0 / np.sqrt(10.0)  # half of the echoes come back when it is dry
+    dry, wet = sweep(far, directions, reach=reach), sweep(far, directions, rain=2.0, reach=reach)
+    surface = depth(wet) > 29.9
+    # Of a signal of 1, 0.5 is seen; of exp(−0.02 · 2^0.6 · 30), by the law of the third power, and texture of 20 %.
+    signal = np.exp(-0.02 * 2**0.6 * 30.0)
+    expected = signal**3 / (1 + signal**3)
+    assert depth(dry).size == pytest.approx(0.5 * len(directions), rel=0.05)
+    assert surface.sum() == pytest.approx(expected * len(directions), rel=0.2)
+    drops = wet.points.numpy()[: wet.count.numpy()[0]][~surface]
+    share = 5e-4 * 2**0.6 * 10.0
+    assert len(drops) == pytest.approx(share * len(directions), rel=0.2)
+    assert np.median(drops[:, 0]) == pytest.approx(0.5 + 4.0 * np.log(2.0), rel=0.15)
+    assert drops[:, 3].max() < 0.05
+    n = wet.count.numpy()[0]
+    assert (wet.point_class.numpy()[:n][~surface] == 9).all()
+    assert (wet.point_instance.numpy()[:n][~surface] == -1).all()
+    assert (wet.point_class.numpy()[:n][surface] == 0).all()
+
+
+def test_harder_rain_is_worse_and_its_measure_is_checked():
+    directions = np.tile(np.array([[1.0, 0, 0]], np.float32), (5000, 1))
+    counts = [(depth(sweep([wall(40.0, -90, 90)], directions, rain=r, reach=40.0)) > 39).sum() for r in (0, 5, 20, 60)]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] > counts[-1]
+    for rate in (-1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="rate"):
+            sweep([wall(40.0, -90, 90)], directions[:3], rain=rate)
+    with pytest.raises(ValueError, match="edge_share"):
+        sweep([wall(40.0, -90, 90)], directions[:3], edge_share=1.5)
