@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel
@@ -18,6 +18,7 @@ from ..datamesh import (
     Output,
     Status,
     SystemClock,
+    Window,
     declared_handles,
 )
 from .backlog import Backlog, BacklogConfig
@@ -70,6 +71,13 @@ class Component:
         for name, handle in (*self.inputs.items(), *self.outputs.items()):
             handle.bind(name, mesh.window(topics[name]))
 
+    def check(self, config: Any) -> None:
+        """Says what in a configuration does not fit its surroundings; opens and starts nothing. Called before `init`.
+
+        Raises:
+            ValueError: Something does not.
+        """
+
     def init(self, config: Any) -> None:
         """Prepares: `config` is an instance of `Config`."""
 
@@ -116,8 +124,11 @@ class DataProcessComponent(Component):
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
         self.trigger_inputs: tuple[str, ...] = ()
-        self._backlog: Backlog | None = None
+        self.backlog: Backlog | None = None
+        """The triggers that wait; None before `set_trigger`."""
         self._source = TriggerSource()
+        self._wanted: Container[tuple[int, int]] | None = None
+        self._windows: dict[str, Window[Any]] = {}
         self._inline = self._runs_later = False
         self._thread: threading.Thread | None = None
         self._serving = threading.Lock()
@@ -165,26 +176,61 @@ class DataProcessComponent(Component):
                 place=self.name,
                 losses=self.losses,
             )
-        self._backlog = Backlog(self.name, backlog, self.losses)
+        self.backlog = Backlog(self.name, backlog, self.losses)
         inputs = {name: self.inputs[name] for name in config.inputs}
         # Inline it runs when the commit is through: no other one to the topic waits for it.
         self._runs_later = self._inline and backlog.policy != "block" and bool(inputs)
         after = self._advance if self._runs_later else None
+        self._windows = {name: one.window for name, one in inputs.items()}
         if config.any:
-            self._source = AnyTrigger(inputs, self._offer, after)
+            self._source = AnyTrigger(inputs, self._offer, after, None if self._inline else self._rouse)
         elif config.all:
             tolerance = round(config.tolerance_ms * 1e6)
             self._source = AllTrigger(
                 inputs, self._offer, after, tolerance_ns=tolerance, place=self.name, losses=self.losses
             )
 
+    @property
+    def triggers_together(self) -> bool:
+        """Whether its inputs trigger together, at the versions of the first."""
+        return isinstance(self._source, AllTrigger)
+
+    def follow(self, wanted: Container[tuple[int, int]]) -> None:
+        """Lets a replay give the triggers: from here on those of the mesh and of time start no run.
+
+        Args:
+            wanted: Epochs and versions that will be given; the other versions of the mesh are settled.
+        """
+        self._wanted = wanted
+        # It blocks, also where ticks of time would replace each other: nothing of what is given may be lost.
+        self.backlog = Backlog(self.name, BacklogConfig(policy="block"), self.losses)
+        if not self.trigger_inputs:
+            self._source = TriggerSource()
+
+    def give(self, trigger: Trigger) -> None:
+        """Gives a trigger to a component that follows a replay; waits until there is room for it."""
+        self._enqueue(trigger)
+        self._advance()
+
     def _offer(self, trigger: Trigger) -> None:
-        assert self._backlog is not None
-        dropped = self._backlog.offer(trigger)
+        """Takes a trigger of the mesh or of time."""
+        if self._wanted is not None and not trigger.settled:
+            if (trigger.epoch, trigger.version) not in self._wanted:
+                self.settle(trigger.version, trigger.epoch)
+        elif self._enqueue(trigger) and not self._runs_later:
+            self._advance()
+
+    def _enqueue(self, trigger: Trigger) -> bool:
+        assert self.backlog is not None
+        dropped = self.backlog.offer(trigger)
         if dropped is not None:
             self.settle(dropped.version, dropped.epoch)
-        if dropped is not trigger and not self._runs_later:
-            self._advance()
+        return dropped is not trigger
+
+    def _rouse(self) -> None:
+        """Wakes the thread that a trigger is about to need."""
+        assert self.backlog is not None
+        self.backlog.rouse()
 
     def _advance(self) -> None:
         """Goes on with what waits, in the calling thread, where that is how it runs."""
@@ -192,7 +238,7 @@ class DataProcessComponent(Component):
             self._serve_inline()
 
     def _is_busy(self) -> bool:
-        return self._running is not None or bool(self._backlog)
+        return self._running is not None or bool(self.backlog and self.backlog.waiting)
 
     def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
         """Says on every output that was not committed at `version` that there will be nothing."""
@@ -209,8 +255,8 @@ class DataProcessComponent(Component):
             raise RuntimeError(f"{self.name} cannot start again: it hangs at version {self._running.version}")
         for handle in self.inputs.values():
             handle.allow_waits()
-        if self._backlog is not None:
-            self._backlog.open()
+        if self.backlog is not None:
+            self.backlog.open()
             self._start_serving()
         self._source.start()
 
@@ -222,8 +268,8 @@ class DataProcessComponent(Component):
     def stop(self) -> None:
         """Serves what waits, then ends the thread. Waits for data end at once, with SHUTDOWN."""
         self._source.stop()
-        if self._backlog is not None:
-            self._backlog.close()
+        if self.backlog is not None:
+            self.backlog.close()
         for handle in self.inputs.values():
             handle.end_waits()
         self._finish()
@@ -253,22 +299,22 @@ class DataProcessComponent(Component):
 
     def _drop_waiting(self) -> None:
         """Settles what waits behind something that hangs."""
-        while self._backlog is not None and (trigger := self._backlog.take_now()) is not None:
+        while self.backlog is not None and (trigger := self.backlog.take_now()) is not None:
             if not trigger.settled:
                 self.losses.count(self.name, "shutdown", trigger.version)
             self.settle(trigger.version, trigger.epoch)
 
     def _serve(self) -> None:
-        assert self._backlog is not None
-        while (trigger := self._backlog.take()) is not None:
+        assert self.backlog is not None
+        while (trigger := self.backlog.take()) is not None:
             self._run(trigger)
 
     def _serve_inline(self) -> None:
         """Serves what waits, unless another thread does that already, which then serves it too."""
-        assert self._backlog is not None
-        while len(self._backlog) and self._serving.acquire(blocking=False):
+        assert self.backlog is not None
+        while self.backlog.waiting and self._serving.acquire(blocking=False):
             try:
-                while (trigger := self._backlog.take_now()) is not None:
+                while (trigger := self.backlog.take_now()) is not None:
                     self._run(trigger)
             finally:
                 self._serving.release()
@@ -299,8 +345,9 @@ class DagComponent(DataProcessComponent):
 
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
+        self.vertices: Sequence[Vertex] = ()
+        """Of its graph."""
         self._engine: GraphEngine | None = None
-        self._vertices: Sequence[Vertex] = ()
         self._deadline: DeadlineConfig | None = None
         self._closed = self._stopping = False
         self._submitting = threading.Lock()
@@ -328,7 +375,7 @@ class DagComponent(DataProcessComponent):
         """Sets the vertices, initialised, and how many frames may be in the graph at once."""
         if self.max_in_flight is not None:
             in_flight = min(in_flight, self.max_in_flight)
-        self._vertices = vertices
+        self.vertices = vertices
         self._deadline = deadline
         self.in_flight = self._free = in_flight
         self._engine = GraphEngine(self.name, vertices, workers, on_timing)
@@ -343,7 +390,7 @@ class DagComponent(DataProcessComponent):
         self._engine.start()
         try:
             if self._closed:
-                for vertex in self._vertices:
+                for vertex in self.vertices:
                     vertex.processor.init(vertex.config)
         except BaseException:
             self._engine.stop()
@@ -355,16 +402,21 @@ class DagComponent(DataProcessComponent):
     def _start_serving(self) -> None:
         """The workers do that."""
 
+    def _rouse(self) -> None:
+        assert self._engine is not None
+        if self._free > 0:
+            self._engine.rouse()
+
     def _finish(self) -> None:
         """Finishes the frames that wait or are in flight, and closes the processors."""
         assert self._engine is not None
-        assert self._backlog is not None
-        backlog = self._backlog
+        assert self.backlog is not None
+        backlog = self.backlog
         self._stopping = True
         self._advance()
         with self._idle:
             finished = self._idle.wait_for(
-                lambda: self._free == self.in_flight and not len(backlog) and not self._submitting.locked(),
+                lambda: self._free == self.in_flight and not backlog.waiting and not self._submitting.locked(),
                 self.stop_timeout_s,
             )
         hanging = {} if finished else self._engine.running()
@@ -372,7 +424,7 @@ class DagComponent(DataProcessComponent):
         if not finished:
             self._hangs(hanging)
             self._drop_waiting()
-        for vertex in self._vertices:
+        for vertex in self.vertices:
             if ended or vertex.name not in hanging:
                 try:
                     vertex.processor.close()
@@ -381,7 +433,7 @@ class DagComponent(DataProcessComponent):
         self._closed = True
 
     def _is_busy(self) -> bool:
-        return self._free == 0 or bool(self._backlog)
+        return self._free == 0 or bool(self.backlog and self.backlog.waiting)
 
     def _advance(self) -> None:
         self._submit_waiting(serves=self._inline)
@@ -390,12 +442,12 @@ class DagComponent(DataProcessComponent):
 
     def _submit_waiting(self, *, serves: bool) -> None:
         """Submits what waits, while there is room in the graph; who calls says whether it serves the graph next."""
-        assert self._backlog is not None
+        assert self.backlog is not None
         assert self._engine is not None
-        while len(self._backlog) and self._free > 0:
+        while self.backlog.waiting and self._free > 0:
             with self._submitting:  # frames enter in their order
                 # While no slot is free, triggers wait in the backlog, where its policy rules.
-                trigger = self._backlog.take_now() if self._free > 0 else None
+                trigger = self.backlog.take_now() if self._free > 0 else None
                 if trigger is None:
                     break
                 try:
@@ -425,22 +477,21 @@ class DagComponent(DataProcessComponent):
     def _data(self, trigger: Trigger) -> dict[str, Any] | None:
         """The data that triggered, by input; None, counted, where they are gone."""
         data: dict[str, Any] = {}
-        stream = getattr(self.context, "stream", None)
         for name, version in trigger.inputs.items():
-            snapshot = self.inputs[name].window.snapshot(trigger.epoch, stream)
-            index = snapshot.version_index(version)
-            if index < 0:
-                miss = snapshot.miss(version)
+            entry = self._windows[name].find(version, trigger.epoch)
+            if entry is None:
+                miss = self._windows[name].snapshot(trigger.epoch).miss(version)
                 self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
                 return None
-            data[name] = snapshot[index]
+            written = entry.completion is None
+            data[name] = entry.value if written else entry.read(getattr(self.context, "stream", None))
         return data
 
     def _done(self, run: Run) -> None:
         trigger = run.trigger
         for name, version in trigger.inputs.items():
-            if self.inputs[name].window.check:
-                self.inputs[name].window.verify_version(version, trigger.epoch)
+            if self._windows[name].check:
+                self._windows[name].verify_version(version, trigger.epoch)
         if run.deadline is not None and run.deadline.end():
             self.losses.count(self.name, "deadline", trigger.version)
         if run.error is not None:

@@ -42,6 +42,7 @@ class Process:
         on_timing: Callable[[VertexTiming], None] | None = None,
         check: bool = False,
         switch_interval_s: float | None = 100e-6,
+        prepare: bool = True,
     ) -> None:
         """Builds, checks and initialises all components.
 
@@ -56,6 +57,8 @@ class Process:
             check: Payloads are compared with what they were at their commit; see `DataMesh`.
             switch_interval_s: How long a thread that computes in Python keeps others waiting, while this process runs
                 (`sys.setswitchinterval`); None leaves it as it is. Python's own 5 ms are as much as a frame's share.
+            prepare: False only validates: nothing is initialised, so no kernel is compiled and no model loaded, and
+                what was made cannot be started.
 
         Raises:
             ConfigError: A module does not fit its classes or the others.
@@ -69,7 +72,8 @@ class Process:
         built = [self._declare(place, context) for place in places]
         self._check_topics(places, external or {})
         for (file, index), (component, vertices) in zip(places, built, strict=True):
-            self._prepare(file, index, component, vertices, offline, on_timing)
+            self._prepare(file, index, component, vertices, offline, on_timing, prepare)
+        self._prepared = prepare
 
     def _declare(self, place: _Place, context: Any) -> tuple[Component, list[DeclaredVertex]]:
         """Makes a component and its vertices, neither bound nor initialised."""
@@ -210,8 +214,9 @@ class Process:
         vertices: Sequence[DeclaredVertex],
         offline: bool,
         on_timing: Callable[[VertexTiming], None] | None,
+        prepare: bool,
     ) -> None:
-        """Binds a component to the mesh and initialises it."""
+        """Binds a component to the mesh, checks it and initialises it."""
         spec = file.content.components[index]
         keys = ["components", index]
         topics = {**spec.inputs, **spec.outputs}
@@ -224,7 +229,9 @@ class Process:
             vertex.processor.place = f"{spec.name}.{vertex.name}"
             vertex.processor.losses = self.mesh.losses
             try:
-                vertex.processor.init(declared.config)
+                vertex.processor.check(declared.config)
+                if prepare:
+                    vertex.processor.init(declared.config)
             except (ValueError, TypeError, KeyError) as error:
                 raise file.error([*keys, "graph", vertex.name, "config"], str(error)) from error
         if isinstance(component, DagComponent):
@@ -241,7 +248,9 @@ class Process:
         if not isinstance(component, GenericComponent):
             config = file.validate([*keys, "config"], component.Config, spec.config)
             try:
-                component.init(config)
+                component.check(config)
+                if prepare:
+                    component.init(config)
             except (ValueError, TypeError, KeyError) as error:
                 raise file.error([*keys, "config"], str(error)) from error
         if isinstance(component, DataProcessComponent):
@@ -261,7 +270,13 @@ class Process:
         return max((c.in_flight for c in self.components.values() if isinstance(c, DagComponent)), default=1)
 
     def start(self) -> None:
-        """Starts the components, those that consume before those that produce; all of them, or none. And again."""
+        """Starts the components, those that consume before those that produce; all of them, or none. And again.
+
+        Raises:
+            RuntimeError: It was made to be validated, with `prepare=False`.
+        """
+        if not self._prepared:
+            raise RuntimeError("this process was only validated: make it without prepare=False to start it")
         self._switching.hold()
         for component in self._consumers_first():
             try:

@@ -125,6 +125,13 @@ class Processor:
         for name, port in self.ports.items():
             setattr(self, name, port)
 
+    def check(self, config: Any) -> None:
+        """Says what in a configuration does not fit its surroundings; compiles and loads nothing. Called before `init`.
+
+        Raises:
+            ValueError: Something does not.
+        """
+
     def init(self, config: Any) -> None:
         """Prepares for the first run: builds plans, loads models. `config` is an instance of `Config`."""
 
@@ -179,7 +186,9 @@ class ProcessorHarness:
         self.processor.context = context
         self.processor.component_inputs = inputs or {}
         self.processor.component_outputs = outputs or {}
-        self.processor.init(processor.Config.model_validate(dict(config or {})))
+        validated = processor.Config.model_validate(dict(config or {}))
+        self.processor.check(validated)
+        self.processor.init(validated)
         self.status: Status | None = None
 
     def feed(self, **inputs: Any) -> Self:

@@ -64,12 +64,12 @@ class GetRecentDagProcessor(Processor):
     value: Out[Any]
     version: Out[int]
 
-    def init(self, config: _GetRecentConfig) -> None:
-        """Finds the input.
+    def check(self, config: _GetRecentConfig) -> None:
+        """Looks whether the component has the input."""
+        _input_of(self, config.input)
 
-        Raises:
-            ValueError: The component has no such input.
-        """
+    def init(self, config: _GetRecentConfig) -> None:
+        """Finds the input."""
         self._input = _input_of(self, config.input)
         self._max_age = None if config.max_age_ms is None else round(config.max_age_ms * 1e6)
         self._name = config.input
@@ -153,12 +153,13 @@ class AlignDagProcessor(Processor):
 
     aligned: Out[Aligned]
 
-    def init(self, config: _AlignConfig) -> None:
-        """Finds the inputs.
+    def check(self, config: _AlignConfig) -> None:
+        """Looks whether the component has the inputs."""
+        for name in config.inputs:
+            _input_of(self, name)
 
-        Raises:
-            ValueError: The component has no such input.
-        """
+    def init(self, config: _AlignConfig) -> None:
+        """Finds the inputs."""
         self._inputs = {name: _input_of(self, name) for name in config.inputs}
         self._timeout, self._tolerance = round(config.timeout_ms * 1e6), round(config.tolerance_ms * 1e6)
         self._partial = config.partial
@@ -238,15 +239,14 @@ class CommitDagProcessor(Processor):
 
     value: In[Any]
 
-    def init(self, config: _CommitConfig) -> None:
-        """Finds the output.
-
-        Raises:
-            ValueError: The component has no such output.
-        """
+    def check(self, config: _CommitConfig) -> None:
+        """Looks whether the component has the output."""
         if config.output not in self.component_outputs:
             known = ", ".join(self.component_outputs) or "none"
             raise ValueError(f"the component has no output {config.output!r}; it has: {known}")
+
+    def init(self, config: _CommitConfig) -> None:
+        """Finds the output."""
         self._output = self.component_outputs[config.output]
         self._policy: CommitPolicy | Reorder
         if config.policy == "reorder":

@@ -12,7 +12,7 @@ import logging
 import os
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -60,6 +60,7 @@ class Trace:
         self._on_way: set[tuple[int, int]] = set()
         self._lost: dict[str, int] = {}
         self._numbers = 0
+        self._unsubscribe: list[Callable[[], None]] = []
         self._closing = threading.Event()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -80,9 +81,11 @@ class Trace:
             results: Topics with which a frame is done: there they end, and the latency is taken.
         """
         for topic in sources:
-            mesh.window(topic).subscribe(partial(self._on_commit, topic, False), lambda *_: None)
+            on_commit = partial(self._on_commit, topic, False)
+            self._unsubscribe.append(mesh.window(topic).subscribe(on_commit, lambda *_: None))
         for topic in results:
-            mesh.window(topic).subscribe(partial(self._on_commit, topic, True), partial(self._on_settle, mesh, topic))
+            on_commit, on_settle = partial(self._on_commit, topic, True), partial(self._on_settle, mesh, topic)
+            self._unsubscribe.append(mesh.window(topic).subscribe(on_commit, on_settle))
         mesh.losses.on_loss(partial(self._on_loss, mesh))
 
     def on_timing(self, timing: VertexTiming) -> None:
@@ -104,7 +107,7 @@ class Trace:
         if self._threads.get(thread) != name:  # the number of a thread that ended is given to another
             self._threads[thread] = name
             self._events.append((thread, "thread", name))
-        if self.failure is not None or len(self._events) > _MOST:
+        if self.failure is not None or self._closing.is_set() or len(self._events) > _MOST:
             self.dropped += 1
         else:
             self._events.append((thread, *event))
@@ -197,6 +200,8 @@ class Trace:
         """Writes what is left. Twice is no harm; a failure is in `failure`, and not raised."""
         if self._closing.is_set():
             return
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
         self._closing.set()
         self._thread.join()
         self._flush()
