@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
-from ..dag import Process, draw_mermaid, draw_svg, draw_text, find_config, load_module, parse_overrides
+from ..dag import (
+    ConfigFile,
+    ModuleSpec,
+    Process,
+    draw_mermaid,
+    draw_svg,
+    draw_text,
+    find_config,
+    load_module,
+    parse_overrides,
+)
 from ..dag.graph import declare_vertices
+from ..dag.launch.lookup import config_folders
 from ..errors import ConfigError
 from .execution import ExecutionContext
 from .messages import SensorFrame
-from .pipeline import LIDAR_TOPIC, Pipeline, profile_modules
-from .profile import CONF, load_profile
+from .pipeline import LIDAR_TOPIC, profile_modules, refuse_unknown
+from .profile import CONF, execution_context, load_profile, profile_device
 
 __all__ = ["FORMATS", "check_file", "draw_file"]
 
@@ -35,21 +47,54 @@ def check_file(name: str, settings: Iterable[str] = ()) -> list[str]:
         DeviceError: There is no such device.
     """
     path, kind = _find(name)
-    if kind == "profiles":
-        pipeline = Pipeline.from_profile(str(path), settings=settings)
-        profile = pipeline.profile
-        pipeline.close()
-        return [
-            f"{path}: profile {profile.profile!r} is good",
-            f"  device {pipeline.device}, modules {profile.modules}",
-        ]
     changes = {tuple(key.split(".")): value for key, value in parse_overrides(settings).items()}
+    if kind == "profiles":
+        return _check_profile(path, changes)
     file = load_module(path, changes)
-    Process([file], context=ExecutionContext(), external={LIDAR_TOPIC: SensorFrame})
     components = file.content.components
+    elsewhere = _topics_elsewhere(file)
+    Process(
+        [file],
+        context=ExecutionContext(),
+        external={LIDAR_TOPIC: SensorFrame} | dict.fromkeys(elsewhere, object),
+        prepare=False,
+    )
     lines = [f"{path}: module {file.content.module!r} is good"]
     lines += [f"  {component.name} ({component.kind}), {len(component.graph)} vertices" for component in components]
+    lines += [f"  reads {topic}, which {module} gives" for topic, module in elsewhere.items()]
     return lines
+
+
+def _check_profile(path: Path, changes: Mapping[tuple[str, ...], Any]) -> list[str]:
+    of_profile = {keys[1:]: value for keys, value in changes.items() if keys[0] == "profile"}
+    of_modules = {keys: value for keys, value in changes.items() if keys[0] != "profile"}
+    file = load_profile(str(path), of_profile)
+    profile = file.content
+    modules = profile_modules(file, of_modules)
+    refuse_unknown(of_modules, modules)
+    device = profile_device(profile)
+    Process(modules, context=execution_context(file, device), external={LIDAR_TOPIC: SensorFrame}, prepare=False)
+    return [f"{path}: profile {profile.profile!r} is good", f"  device {device}, modules {profile.modules}"]
+
+
+def _topics_elsewhere(file: ConfigFile[ModuleSpec]) -> dict[str, str]:
+    """Topics that a module reads and does not give, but another module file gives, and the name of that module."""
+    components = file.content.components
+    given = {topic for component in components for topic in component.outputs.values()} | {LIDAR_TOPIC}
+    wanted = {topic for component in components for topic in component.inputs.values()} - given
+    found: dict[str, str] = {}
+    if not wanted:
+        return found
+    for folder in config_folders(CONF):
+        for path in sorted((folder / "modules").rglob("*.yaml")):
+            try:
+                module = load_module(path).content
+            except ConfigError:  # it is another file's mistake
+                continue
+            for component in module.components:
+                for topic in wanted & set(component.outputs.values()):
+                    found.setdefault(topic, module.module)
+    return found
 
 
 def draw_file(name: str, form: str = "text", settings: Iterable[str] = ()) -> str:

@@ -170,12 +170,7 @@ class Pipeline:
         if workers is not None:
             graphs = {(one.name, key): workers for one in components if one.graph for key in ("workers", "in_flight")}
             modules = profile_modules(profile, {**of_modules, **graphs})
-        known = {component.name for component in components}
-        for keys in of_modules:
-            if keys[0] not in known:
-                raise ConfigError(
-                    f"setting {'.'.join(keys)}: no component {keys[0]!r}; {nearest(keys[0], {*known, 'profile'})}"
-                )
+        refuse_unknown(of_modules, modules)
         use_threads(profile.content)
         return cls(profile, modules, profile_device(profile.content, device))
 
@@ -293,6 +288,24 @@ def profile_modules(
         if key.split(".")[0] not in known:
             raise profile.error(["settings", key], f"no component {key.split('.')[0]!r}; {nearest(key, known)}")
     return files
+
+
+def refuse_unknown(settings: Iterable[tuple[str, ...]], modules: Iterable[ConfigFile[ModuleSpec]]) -> None:
+    """Refuses settings for components that none of the modules has.
+
+    Args:
+        settings: Their dotted keys, in parts.
+        modules: The modules that they are for.
+
+    Raises:
+        ConfigError: There is such a setting.
+    """
+    known = {component.name for module in modules for component in module.content.components}
+    for keys in settings:
+        if keys[0] not in known:
+            raise ConfigError(
+                f"setting {'.'.join(keys)}: no component {keys[0]!r}; {nearest(keys[0], {*known, 'profile'})}"
+            )
 
 
 def _find_module(profile: ConfigFile[Profile], name: str) -> Path:

@@ -38,16 +38,19 @@ class ChainProcessor(Processor):
     ground: Out[GroundSurface]
     clusters: Out[Clusters]
 
-    def init(self, config: ChainProcessorConfig) -> None:
-        """Makes a chain for each frame in flight.
+    def check(self, config: ChainProcessorConfig) -> None:
+        """Looks whether Warp computes all of it.
 
         Raises:
             ValueError: The backend is not Warp.
         """
-        context = self.context
-        for backend in (config.backend, *context.backends.values()):
+        for backend in (config.backend, *self.context.backends.values()):
             if backend not in (None, "warp"):
                 raise ValueError(f"backend must be 'warp' in a chain, not {backend!r}; single stages have others")
+
+    def init(self, config: ChainProcessorConfig) -> None:
+        """Makes a chain for each frame in flight."""
+        context = self.context
         stages = ChainConfig(
             stages=("cluster",),
             point_range=config.point_range,

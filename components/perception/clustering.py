@@ -60,18 +60,22 @@ class ClusterProcessor(Processor):
     ground: In[GroundSurface]
     clusters: Out[Clusters]
 
-    def init(self, config: ClusterConfig) -> None:
-        """Makes a plan for each frame in flight; one for Taichi, whose labels are copied.
+    def check(self, config: ClusterConfig) -> None:
+        """Looks whether the library computes here.
 
         Raises:
             DeviceError: Taichi cannot compute on its device.
         """
+        self._backend = config.backend or self.context.backends.get("cluster", "warp")
+        uses_taichi(self._backend)
+
+    def init(self, config: ClusterConfig) -> None:
+        """Makes a plan for each frame in flight; one for Taichi, whose labels are copied."""
         capacity, device = self.context.capacity, self.context.device
         self._config = config
         self._include = wp.zeros(capacity, dtype=wp.bool, device=device)
         what = {"radius": config.radius, "radius_per_metre": config.radius_per_metre, "min_size": config.min_size}
-        self._backend = config.backend or self.context.backends.get("cluster", "warp")
-        if uses_taichi(self._backend):
+        if self._backend != "warp":
             from ...kernels.taichi import cluster as in_taichi
 
             self._in_taichi = in_taichi.EuclideanCluster(**what, capacity=capacity, device=self._backend)

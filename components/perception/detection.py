@@ -6,6 +6,7 @@ from pydantic import Field
 
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
+from ...models.card import DEFAULT_CARD, load_card
 from ...models.detections import Detections
 from ...models.head import DetectionHead
 from ..execution import ExecutionContext
@@ -32,12 +33,16 @@ class DetectionProcessor(Processor):
     ground: In[GroundSurface]
     foreground: Out[Detections]
 
-    def init(self, config: DetectionConfig) -> None:
-        """Loads the head and runs it once, so that the first frame takes no longer than the others.
+    def check(self, config: DetectionConfig) -> None:
+        """Looks whether the head is there and fits its card.
 
         Raises:
-            ModelError: The model does not fit its card.
+            ModelError: It is not, or does not.
         """
+        load_card(self.context.detector or DEFAULT_CARD)
+
+    def init(self, config: DetectionConfig) -> None:
+        """Loads the head and runs it once, so that the first frame takes no longer than the others."""
         context = self.context
         self._head = DetectionHead(
             context.detector,

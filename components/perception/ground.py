@@ -47,15 +47,19 @@ class GroundProcessor(Processor):
     filtered: In[FilteredCloud]
     ground: Out[GroundSurface]
 
-    def init(self, config: GroundConfig) -> None:
-        """Makes a plan for each frame in flight; Taichi keeps its own.
+    def check(self, config: GroundConfig) -> None:
+        """Looks whether the library computes here.
 
         Raises:
             DeviceError: Taichi cannot compute on its device.
         """
+        self._backend = config.backend or self.context.backends.get("ground", "warp")
+        uses_taichi(self._backend)
+
+    def init(self, config: GroundConfig) -> None:
+        """Makes a plan for each frame in flight; Taichi keeps its own."""
         context = self.context
-        self._backend = config.backend or context.backends.get("ground", "warp")
-        if uses_taichi(self._backend):
+        if self._backend != "warp":
             segment_ground(empty_cloud(context.device)[0], backend=self._backend)
             return
         plans = [

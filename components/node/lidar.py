@@ -1,0 +1,200 @@
+"""The LiDAR's driver as the node sees it: sweeps at the sensor's rate, played by the simulator or a recording.
+
+A simulator or a decoder may be slower than the sensor, so frames are made ahead: the first seconds of a drive, which
+are then played to and fro. Each frame follows the one before it by one period of motion, forwards or backwards, so
+that what perceives it sees one continuous drive however long it lasts.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+from pydantic import Field
+
+from ...dag import Component, ProcessorConfig
+from ...datamesh import CommitPolicy, Output
+from ...datamesh.clock import Timer
+from ...errors import WarploomError
+from ..execution import ExecutionContext
+from ..messages import SensorFrame
+
+__all__ = ["LidarDriver", "LidarDriverConfig"]
+
+_log = logging.getLogger(__name__)
+
+
+class LidarDriverConfig(ProcessorConfig):
+    """Which sensor, and who plays it."""
+
+    sensor: str
+    """Name of the sensor in the profile."""
+    model: str = "pandar90"
+    """Its type, where the profile does not say."""
+    rate_hz: float = Field(10.0, gt=0.0, le=100.0)
+    """Sweeps a second, where the profile does not say."""
+    source: str | None = None
+    """Who plays it, as a URI of `--source`, where the profile does not say; null: the simulator, with this sensor."""
+    seed: int = Field(7, ge=0)
+    """Of the simulated street."""
+    ahead_s: float = Field(2.0, gt=0.0, le=60.0)
+    """How much of the drive is made before it is played [s]."""
+    play: Literal["to_and_fro", "once"] = "to_and_fro"
+    """to_and_fro: what was made ahead, without end; once: the whole source, at its rate or as fast as it can."""
+
+
+class LidarDriver(Component):
+    """Commits the sweeps of one LiDAR, each at its time by the clock of the mesh.
+
+    The version of a sweep is its time of reception. A sweep that was not ready in time is committed when it is, and
+    counted as `late`.
+    """
+
+    Config = LidarDriverConfig
+    context: ExecutionContext | None
+
+    cloud: Output[SensorFrame]
+
+    def __init__(self, name: str, context: Any = None) -> None:
+        super().__init__(name, context)
+        self._config = LidarDriverConfig(sensor=name)
+        self._uri = ""
+        self._period_ns = 100_000_000
+        self._stopping = threading.Event()
+        self._tick = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._phase = "not started"
+        self._committed = self._late = 0
+        self._failure: str | None = None
+
+    def init(self, config: LidarDriverConfig) -> None:
+        """Finds out what plays the sensor; nothing is opened before the start."""
+        self._config = config
+        sensor = (self.context or ExecutionContext()).sensors.get(config.sensor)
+        rate = getattr(sensor, "rate_hz", None) or config.rate_hz
+        self._period_ns = round(1e9 / rate)
+        source = getattr(sensor, "source", None) or config.source
+        if source is None:
+            model = getattr(sensor, "model", None) or config.model
+            source = f"sim:street?seed={config.seed}&lidar={model}&rate={rate:g}&duration={config.ahead_s:g}"
+            mounting = getattr(sensor, "mounting", None)
+            if mounting is not None and mounting.xyz[2] > 0:
+                source += f"&mounting_height={mounting.xyz[2]:g}"
+        self._uri = source
+
+    @property
+    def source(self) -> str:
+        """The URI of what plays the sensor."""
+        return self._uri
+
+    def start(self) -> None:
+        """Starts the thread that makes and commits the sweeps."""
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._run, name=self.name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends it, at the latest when a frame that is being made is done."""
+        self._stopping.set()
+        self._tick.set()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join()
+        self._phase = "stopped"
+
+    @property
+    def idle_because(self) -> str | None:
+        """Why no sweeps come: its source failed, or has come to its end."""
+        if self._failure is not None:
+            return f"{self._uri}: {self._failure}"
+        return f"{self._uri} is at its end" if self._phase == "ended" else None
+
+    def state(self) -> Mapping[str, str | float | int]:
+        """What plays it, and how many sweeps it gave."""
+        return {
+            "source": self._uri,
+            "phase": self._phase,
+            "rate_hz": round(1e9 / self._period_ns, 3),
+            "sweeps": self._committed,
+            "late": self._late,
+        }
+
+    def _run(self) -> None:
+        try:
+            self._phase = "making frames"
+            frames = self._frames()
+            first = next(frames, None)
+            self._phase = "playing"
+            due = self.clock.monotonic_ns()
+            index = 0
+            while first is not None and not self._stopping.is_set():
+                self._commit(replace(first, version=self.clock.now_ns(), index=index, frame_id=self._config.sensor))
+                index += 1
+                first = next(frames, None)
+                due = self._wait(due + self._period_ns)
+            self._phase = "ended"
+        except WarploomError as error:
+            self._failure = str(error)
+        except Exception as error:
+            self._failure = f"{type(error).__name__}: {error}"
+        if self._failure is not None:
+            self._phase = "failed"
+            _log.error("%s gives no more sweeps: %s: %s", self.name, self._uri, self._failure)
+
+    def _frames(self) -> Iterator[SensorFrame]:
+        """The sweeps in the order in which they are played."""
+        from ..sources import open_source
+
+        context = self.context or ExecutionContext()
+        source = open_source(self._uri, device=context.device)
+        if self._config.play == "once":
+            yield from source
+            return
+        made: list[SensorFrame] = []
+        for frame in source:
+            if self._stopping.is_set():
+                return
+            made.append(frame)
+            if len(made) * self._period_ns >= self._config.ahead_s * 1e9:
+                break
+        last = len(made) - 1
+        position, step = 0, 1
+        while made:
+            frame = made[position]
+            yield frame if step > 0 else _backwards(frame)
+            if not 0 <= position + step <= last:
+                step = -step
+            position = min(max(position + step, 0), last)
+
+    def _wait(self, due: int) -> int:
+        """Waits until a sweep is due, by the clock of the mesh; gives when it was, or is now where that is past."""
+        now = self.clock.monotonic_ns()
+        if now >= due:
+            if now > due + self._period_ns // 2:
+                self._late += 1
+                self.losses.count(self.name, "late", self.clock.now_ns())
+                return now
+            return due
+        self._tick.clear()
+        timer: Timer = self.clock.call_at(due, self._tick.set)
+        if not self._stopping.is_set():
+            self._tick.wait()
+        timer.cancel()
+        return due
+
+    def _commit(self, frame: SensorFrame) -> None:
+        with self.cloud.allocate_change() as change:
+            change.set_version(frame.version)
+            change.value = frame
+            self.cloud.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+        self._committed += 1
+
+
+def _backwards(frame: SensorFrame) -> SensorFrame:
+    """A frame as it is seen while the drive goes backwards: what moves goes the other way."""
+    if frame.truth is None:
+        return frame
+    return replace(frame, truth=replace(frame.truth, velocities=-frame.truth.velocities))

@@ -1,0 +1,131 @@
+"""The trace of a process: every vertex, wait, commit and loss of its first seconds, for ui.perfetto.dev."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from ...dag import Component, ProcessorConfig
+from ...dag.trace import Trace
+from ...datamesh import DataMesh
+from ...datamesh.clock import Timer
+from ...errors import SinkError
+from ..execution import ExecutionContext
+from ..pipeline import OBSTACLES_TOPIC
+
+__all__ = ["TraceWriter", "TraceWriterConfig"]
+
+_log = logging.getLogger(__name__)
+
+
+class TraceWriterConfig(ProcessorConfig):
+    """Where to, and how much."""
+
+    file: str = "trace-{name}-{pid}.json"
+    """The file; one without a folder lies in $WARPLOOM_RUN, or else in the folder for temporary files."""
+    seconds: float = Field(30.0, ge=0.0)
+    """How long is traced from the start [s]; 0: nothing. A second of perception is some 100 kB."""
+    results: tuple[str, ...] = (OBSTACLES_TOPIC,)
+    """Topics with which a frame is done: its latency is taken there."""
+
+
+class TraceWriter(Component):
+    """Writes it. A disk that is full or not permitted costs the trace and nothing else."""
+
+    Config = TraceWriterConfig
+    context: ExecutionContext | None
+
+    def __init__(self, name: str, context: Any = None) -> None:
+        super().__init__(name, context)
+        self._mesh: DataMesh | None = None
+        self._config = TraceWriterConfig()
+        self._trace: Trace | None = None
+        self._timer: Timer | None = None
+        self._failure: str | None = None
+        self._done = False
+
+    def bind(self, mesh: DataMesh, topics: Mapping[str, str]) -> None:
+        """Keeps the mesh whose commits are traced."""
+        super().bind(mesh, topics)
+        self._mesh = mesh
+
+    def check(self, config: TraceWriterConfig) -> None:
+        """Checks the name of the file.
+
+        Raises:
+            ValueError: It holds a placeholder that is not known.
+        """
+        self._path(config)
+
+    def init(self, config: TraceWriterConfig) -> None:
+        """Keeps where to."""
+        self._config = config
+
+    def _path(self, config: TraceWriterConfig) -> Path:
+        try:
+            path = Path(config.file.format(name=self.name, pid=os.getpid()))
+        except (KeyError, IndexError, ValueError) as error:
+            raise ValueError(f"file: {{name}} and {{pid}} are the placeholders, not {error}") from None
+        if path.parent == Path():
+            path = Path(os.environ.get("WARPLOOM_RUN") or tempfile.gettempdir()) / path
+        return path
+
+    def start(self) -> None:
+        """Creates the file and begins."""
+        if self._config.seconds == 0.0:
+            return
+        assert self._mesh is not None
+        try:
+            self._trace = Trace(self._path(self._config), self.name)
+        except SinkError as error:
+            self._failure = str(error)
+            _log.error("%s: %s", self.name, error)
+            return
+        results = [topic for topic in self._config.results if topic in self._mesh.topics()]
+        others = [topic for topic in self._mesh.topics() if topic not in results]
+        self._trace.watch(self._mesh, others, results)
+        if self.context is not None:
+            self.context.timings.watch(self._trace.on_timing)
+        self._done = False
+        self._timer = self.clock.call_at(self.clock.monotonic_ns() + round(self._config.seconds * 1e9), self._is_over)
+
+    def _is_over(self) -> None:
+        # Writing takes a while, and the clock has other calls to make.
+        threading.Thread(target=self._end, name=f"{self.name}-end", daemon=True).start()
+
+    def _end(self) -> None:
+        trace = self._trace
+        if trace is None:
+            return
+        self._done = True
+        if self.context is not None:
+            self.context.timings.forget(trace.on_timing)
+        trace.close()
+
+    def stop(self) -> None:
+        """Writes the trace to its end."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._end()
+
+    @property
+    def idle_because(self) -> str | None:
+        """It is off, is done, or cannot write."""
+        if self._config.seconds == 0.0:
+            return f"{self.name}.seconds is 0"
+        if self._trace is not None and self._trace.failure is not None:
+            return f"{self._trace.path}: {self._trace.failure}"
+        if self._failure is not None:
+            return self._failure
+        return f"the first {self._config.seconds:g} s are written" if self._done else None
+
+    def state(self) -> Mapping[str, str | float | int]:
+        """The file, and what is not in it."""
+        return {"file": str(self._trace.path), "events_dropped": self._trace.dropped} if self._trace else {}
