@@ -77,6 +77,7 @@ class DetectionHead:
             point_range=self.card.input.point_range, cell=self.card.input.cell, capacity=capacity, device=self.device
         )
         self._session, self.provider = _session(model, self.card, self.device, threads, precision)
+        self.fallback = ""
         self._count = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._bind()
         decode = self.card.decode
