@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from ..configuration import ConfigFile
+from ...errors import ConfigError
+from ..configuration import ConfigFile, find_config, nearest
+from ..modules import load_module
 from ..schema import ModuleSpec
+from .lookup import config_folders
 from .schema import LaunchSpec, ProcessSpec
 
-__all__ = ["LaunchPlan"]
+__all__ = ["LaunchPlan", "plan_modules"]
+
+Changes = Mapping[tuple[str, ...], Any]
 
 
 @dataclass(frozen=True)
@@ -40,3 +46,65 @@ class LaunchPlan:
     def processes(self) -> Mapping[str, ProcessSpec]:
         """The processes by name."""
         return {process.name: process for process in self.spec.processes}
+
+
+def plan_modules(
+    file: ConfigFile[LaunchSpec],
+    shipped: Path,
+    *,
+    sensors: Mapping[str, Sequence[str]] | None = None,
+    changes: Changes | None = None,
+    defaults: Changes | None = None,
+) -> dict[str, tuple[ConfigFile[ModuleSpec], ...]]:
+    """Reads the module files of all processes.
+
+    Args:
+        file: The launch file.
+        shipped: The conf folder of the package, searched last.
+        sensors: Names by kind, for the placeholders in the modules.
+        changes: Settings by the parts of their dotted keys; they go before those of the launch file.
+        defaults: The same, of a profile; those of the launch file go before them. One for a component that is in none
+            of the modules is left out.
+
+    Raises:
+        ConfigError: A module is not there, or bad, or stands twice in a process; a setting is for no component.
+    """
+    own = {tuple(key.split(".")): value for key, value in file.content.settings.items()}
+    changes = changes or {}
+    merged = {**(defaults or {}), **own, **changes}
+    modules: dict[str, tuple[ConfigFile[ModuleSpec], ...]] = {}
+    for number, process in enumerate(file.content.processes):
+        files: list[ConfigFile[ModuleSpec]] = []
+        for index, name in enumerate(process.modules):
+            keys = ["processes", number, "modules", index]
+            try:
+                path = _module_path(file.path.parent, name, shipped)
+            except ConfigError as error:
+                raise file.error(keys, str(error)) from None
+            if path.resolve() in [one.path.resolve() for one in files]:
+                raise file.error(keys, f"the module {name!r} stands twice in process {process.name!r}")
+            files.append(load_module(path, merged, sensors))
+        modules[process.name] = tuple(files)
+    known = {component.name for files in modules.values() for one in files for component in one.content.components}
+    for key in own:
+        if key[0] not in known:
+            raise file.error(["settings", ".".join(key)], f"no component {key[0]!r}; {nearest(key[0], known)}")
+    for key in changes:
+        if key[0] not in known:
+            raise ConfigError(
+                f"setting {'.'.join(key)}: no component {key[0]!r}; {nearest(key[0], {*known, 'profile', 'launch'})}"
+            )
+    return modules
+
+
+def _module_path(beside: Path, name: str, shipped: Path) -> Path:
+    """A module file: beside the launch file, or wherever configuration lies."""
+    path = beside / name
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        return path
+    try:
+        return find_config(name, "modules", shipped)
+    except ConfigError:
+        folders = [folder / "modules" for folder in config_folders(shipped)]
+        known = {str(one.relative_to(folder)) for folder in folders for one in folder.rglob("*.yaml")}
+        raise ConfigError(f"no module {name!r}: neither a file nor a name; {nearest(name, known)}") from None

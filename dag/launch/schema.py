@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from ...datamesh.transport import SharedMemoryConfig, ZenohConfig
+
 __all__ = ["BackOffSpec", "HardwareSpec", "LaunchSpec", "ProcessSpec", "RestartsSpec"]
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
@@ -137,6 +139,12 @@ class LaunchSpec(_Spec):
     """The hardware profile, by name, or a path from the launch file's folder."""
     settings: dict[str, Any] = {}
     """Changes to the modules by dotted key, as in a profile."""
+    shared_memory: SharedMemoryConfig = SharedMemoryConfig()
+    """Sizes of the links between the processes."""
+    remote: dict[str, Literal["zenoh"]] = {}
+    """Topics that go between hosts, and how: those committed here are sent, the others come from there."""
+    zenoh: ZenohConfig = ZenohConfig()
+    """The links between hosts."""
     processes: list[ProcessSpec] = Field(min_length=1)
 
     _check_name = field_validator("node")(_is_name)

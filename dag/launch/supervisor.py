@@ -1,0 +1,265 @@
+"""The supervisor of a node: all its processes are ready, or none starts; watched until they are to end; then stopped.
+
+It sleeps until something happens: the end of a process (pidfd), a message of one, a request, a signal, a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import json
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ...errors import ConfigError
+from ..configuration import nearest
+from .cgroup import ControlGroups
+from .control import ControlServer
+from .order import consumers_first
+from .plan import LaunchPlan
+from .run_folder import RotatedLog, RunFolder
+from .schema import ProcessSpec
+from .supervised import FINAL, State, SupervisedProcess
+
+if TYPE_CHECKING:
+    from .linking import LinkPlan
+
+__all__ = ["Supervisor"]
+
+_log = logging.getLogger(__name__)
+
+Event = dict[str, Any]
+
+
+class Supervisor:
+    """Starts, watches and stops the processes of one node."""
+
+    def __init__(
+        self,
+        plan: LaunchPlan,
+        links: Mapping[str, LinkPlan],
+        command: Callable[[ProcessSpec, RunFolder], Sequence[str]],
+        *,
+        reap: Callable[[str], Sequence[str]] = lambda node: (),
+        on_event: Callable[[Event], None] = lambda event: None,
+        child_plan: Callable[[ProcessSpec], Mapping[str, Any]] = lambda spec: {},
+    ) -> None:
+        """Makes it; nothing is started.
+
+        Args:
+            plan: What is to run, validated.
+            links: The topics between the processes, by process.
+            command: What is executed for a process.
+            reap: Removes what dead processes of the node have left of their transport; gives the names of that.
+            on_event: Is told of everything that happens.
+            child_plan: What a process is told in its plan file, further to its name.
+        """
+        self.plan = plan
+        self.links = links
+        self.folder = RunFolder(plan.node)
+        self.processes: dict[str, SupervisedProcess] = {}
+        self.reaped: list[str] = []
+        self._command = command
+        self._reap = reap
+        self._on_event = on_event
+        self._child_plan = child_plan
+        self._groups = ControlGroups()
+        self._gate_open = False
+        self._ending: asyncio.Event = asyncio.Event()
+        self._exit_code = 0
+        self._reason = ""
+        self._interrupts = 0
+        self._control: ControlServer | None = None
+        self._started = time.monotonic()
+
+    def run(self) -> int:
+        """Runs the node until it ends.
+
+        Returns:
+            0 after a stop that was asked for, 2 where a process could not be built, 1 where one died for good.
+
+        Raises:
+            ConfigError: The node runs already, or its folder or socket cannot be made.
+        """
+        if not hasattr(os, "pidfd_open"):
+            raise ConfigError("the launcher runs on Linux alone: it watches processes by pidfd")
+        self.folder.open()
+        try:
+            return asyncio.run(self._run())
+        finally:
+            self._groups.close()
+            self.folder.close()
+
+    def _tell(self, event: Event) -> None:
+        event = {"time": round(time.time(), 3), "node": self.plan.node, **event}
+        self._on_event(event)
+        if self._control is not None:
+            self._control.tell(event)
+
+    async def _run(self) -> int:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, self._interrupted, number)
+        self._control = ControlServer(self.folder.control, self._answers())
+        await self._control.open()
+        try:
+            self._clean()
+            for spec in self.plan.spec.processes:
+                self._add(spec)
+            self._tell({"event": "launching", "pid": os.getpid(), "processes": list(self.processes)})
+            lives = {name: asyncio.create_task(process.live()) for name, process in self.processes.items()}
+            watch = [asyncio.create_task(self._watch(self.processes[name], task)) for name, task in lives.items()]
+            opening = asyncio.create_task(self._open_gate())
+            await self._ending.wait()
+            opening.cancel()
+            await self._stop()
+            await asyncio.gather(*watch)
+            self._clean()
+            self._tell({"event": "ended", "code": self._exit_code, "reason": self._reason})
+            return self._exit_code
+        finally:
+            await self._control.close()
+
+    def _add(self, spec: ProcessSpec) -> None:
+        path = self.folder.plan(spec.name)
+        plan = {
+            "node": self.plan.node,
+            "process": spec.model_dump(),
+            "links": dataclasses.asdict(self.links[spec.name]),
+            "shared_memory": self.plan.spec.shared_memory.model_dump(),
+            "zenoh": self.plan.spec.zenoh.model_dump(),
+            **self._child_plan(spec),
+        }
+        path.write_text(json.dumps(plan, default=str), encoding="utf-8")
+        self.processes[spec.name] = SupervisedProcess(
+            spec,
+            self._command(spec, self.folder),
+            RotatedLog(self.folder.log(spec.name)),
+            groups=self._groups,
+            on_event=self._tell,
+            may_start=lambda: self._gate_open,
+            before_start=self._clean,
+        )
+
+    def _clean(self) -> None:
+        try:
+            removed = list(self._reap(self.plan.node))
+        except OSError as error:
+            _log.warning("what dead processes left cannot be removed: %s", error)
+            return
+        if removed:
+            self.reaped += removed
+            self._tell({"event": "reaped", "removed": removed})
+
+    def start_order(self) -> list[str]:
+        """The names of the processes: consumers before producers."""
+        exports = {name: set(self.links[name].exports) for name in self.links}
+        imports = {name: set(self.links[name].imports) for name in self.links}
+        return consumers_first(exports, imports)
+
+    async def _open_gate(self) -> None:
+        """When all are ready, lets them start one after the other."""
+        for process in self.processes.values():
+            await process.wait_for(State.READY)
+        for name in self.start_order():
+            process = self.processes[name]
+            if process.state is State.READY:
+                process.go()
+            await process.wait_for(State.RUNNING, State.BACKING_OFF)
+        self._gate_open = True
+        for process in self.processes.values():  # one that died meanwhile may be ready again
+            if process.state is State.READY:
+                process.go()
+        self._tell({"event": "up", "seconds": round(time.monotonic() - self._started, 3)})
+
+    async def _watch(self, process: SupervisedProcess, life: asyncio.Task[None]) -> None:
+        """Ends the node where the end of a process asks for that."""
+        try:
+            await life
+        except Exception as error:  # a mistake of ours must not leave the others without a supervisor
+            _log.exception("the supervision of %s failed", process.name)
+            await process.give_up(f"its supervision failed: {type(error).__name__}: {error}")
+        if process.state is State.GAVE_UP:
+            self._end(2 if process.refused else 1, f"{process.name}: {process.refused or process.last_death}")
+        elif process.state is State.ENDED and process.spec.exception_handler == "exit":
+            self._end(0 if process.exit_code == 0 else 1, f"{process.name} {process.last_death}")
+        elif all(one.state in FINAL for one in self.processes.values()):
+            failed = any(one.exit_code for one in self.processes.values())
+            self._end(1 if failed else 0, "no process is left")
+
+    def _end(self, code: int, reason: str) -> None:
+        if not self._ending.is_set():
+            self._exit_code, self._reason = code, reason
+            self._tell({"event": "ending", "code": code, "reason": reason})
+            self._ending.set()
+
+    def _interrupted(self, number: int) -> None:
+        self._interrupts += 1
+        if self._interrupts == 1:
+            self._end(0, f"{signal.Signals(number).name}")
+        else:
+            for process in self.processes.values():
+                process.kill()
+
+    async def _stop(self) -> None:
+        """Stops the processes, those that produce first, each after it has ended."""
+        for name in reversed(self.start_order()):
+            process = self.processes[name]
+            process.ask_to_stop()
+            await process.wait_for()
+
+    def _answers(self) -> dict[str, Callable[[Mapping[str, Any]], Any]]:
+        return {
+            "ps": self._ps,
+            "topics": self._topics,
+            "export": self._export,
+            "restart": self._restart,
+            "stop": self._stop_asked,
+        }
+
+    async def _ps(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        from .status import node_status
+
+        return node_status(self)
+
+    async def _topics(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        from .status import topic_status
+
+        return topic_status(self)
+
+    def producer(self, topic: str) -> SupervisedProcess:
+        """The process that commits a topic.
+
+        Raises:
+            ConfigError: None does.
+        """
+        known: dict[str, SupervisedProcess] = {}
+        for process in self.processes.values():
+            for component in process.components.values():
+                known.update(dict.fromkeys(component.get("outputs", ()), process))
+        if topic not in known:
+            raise ConfigError(f"nobody commits topic {topic!r}; {nearest(topic, known)}")
+        return known[topic]
+
+    async def _export(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        topic = str(request.get("topic", ""))
+        process = self.producer(topic)
+        answer = await process.ask({"do": "export", "topic": topic})
+        if "error" in answer:
+            raise ConfigError(f"topic {topic!r}: {answer['error']}")
+        return {"process": process.name, "topic": topic}
+
+    async def _restart(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        name = str(request.get("process", ""))
+        if name not in self.processes:
+            raise ConfigError(f"no process {name!r}; {nearest(name, self.processes)}")
+        self.processes[name].restart()
+        return {"process": name}
+
+    async def _stop_asked(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        self._end(0, "asked to stop")
+        return {}

@@ -1,0 +1,156 @@
+"""How a node's state is shown: a live table on a terminal, lines of JSON otherwise."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from .supervisor import Supervisor
+
+__all__ = ["JsonLines", "LiveTable", "process_table", "topic_table"]
+
+_SHOWN_EVENTS = 8
+_QUIET = ("state",)
+
+
+class JsonLines:
+    """Writes every event as a line of JSON."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        """Names the stream; by default stdout."""
+        self._stream = sys.stdout if stream is None else stream
+
+    def __call__(self, event: Mapping[str, Any]) -> None:
+        """Writes one; a reader that has gone away is no reason to stop."""
+        try:
+            self._stream.write(json.dumps(event, default=str) + "\n")
+            self._stream.flush()
+        except (OSError, ValueError):
+            pass
+
+
+class LiveTable:
+    """Shows the processes and the last events on a terminal, anew at each event and at most four times a second."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._supervisor: Supervisor | None = None
+        self._events: list[Mapping[str, Any]] = []
+        self._console = Console()
+        self._live = Live(console=self._console, auto_refresh=False, transient=False)
+
+    def show(self, supervisor: Supervisor) -> None:
+        """Begins to show a supervisor."""
+        self._supervisor = supervisor
+        self._live.start()
+
+    def close(self) -> None:
+        """Leaves the last picture on the terminal."""
+        self._live.stop()
+
+    def __call__(self, event: Mapping[str, Any]) -> None:
+        """Takes up an event."""
+        if event["event"] not in _QUIET:
+            self._events = [*self._events, event][-_SHOWN_EVENTS:]
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Draws once."""
+        if self._supervisor is None:
+            return
+        from rich.console import Group
+        from rich.text import Text
+
+        from .status import node_status
+
+        lines = [Text(event_text(event), style=_style(event)) for event in self._events]
+        self._live.update(Group(process_table(node_status(self._supervisor)), *lines), refresh=True)
+
+
+def event_text(event: Mapping[str, Any]) -> str:
+    """An event as a line to read."""
+    at = time.strftime("%H:%M:%S", time.localtime(event.get("time", 0)))
+    hidden = ("time", "node", "event", "process", "last_lines")
+    said = ", ".join(f"{key} {value}" for key, value in event.items() if key not in hidden and value not in ("", None))
+    lines = [f"{at} {event.get('process', '')} {event['event']}{': ' if said else ''}{said}".replace("  ", " ")]
+    lines += [f"           | {line}" for line in event.get("last_lines", ())]
+    return "\n".join(lines)
+
+
+def _style(event: Mapping[str, Any]) -> str:
+    return {"died": "red", "hangs": "red", "warning": "yellow", "up": "green", "ending": "bold"}.get(event["event"], "")
+
+
+def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None, *, wide: bool = True) -> Table:
+    """The processes of a node.
+
+    Args:
+        status: As `ps` is answered.
+        cpu: Share of a core by process id, where it was measured [%].
+        wide: With what the components say of themselves.
+    """
+    from rich.table import Table
+
+    table = Table(title=f"node {status['node']}", title_justify="left")
+    for name in ("process", "state", "pid", "up", "restarts", *(["cpu %"] if cpu is not None else []), "memory", "fds"):
+        table.add_column(name, justify="left" if name in ("process", "state") else "right", no_wrap=True)
+    table.add_column("says", overflow="fold")
+    for process in status["processes"]:
+        says = [*process["warnings"]]
+        if process["last_death"]:
+            says.append(f"last death: {process['last_death']}")
+        for component in process["components"] if wide else ():
+            if component["idle_because"]:
+                says.append(f"{component['name']} is idle: {component['idle_because']}")
+            elif component["state"]:
+                says.append(f"{component['name']}: " + ", ".join(f"{k} {v}" for k, v in component["state"].items()))
+        table.add_row(
+            process["name"],
+            process["state"],
+            str(process["pid"] or "-"),
+            duration_text(process["uptime_s"]),
+            str(process["restarts"]),
+            *([f"{cpu.get(process['pid'], 0.0):.1f}"] if cpu is not None else []),
+            f"{process['rss'] / 2**20:.0f} MiB" if "rss" in process else "-",
+            str(process.get("fds", "-")),
+            "\n".join(says),
+            style="" if process["state"] == "running" else "yellow",
+        )
+    return table
+
+
+def topic_table(topics: Mapping[str, Any]) -> Table:
+    """The topics of a node, as `topics` is answered."""
+    from rich.table import Table
+
+    table = Table(title="topics", title_justify="left")
+    for name in ("topic", "type", "producer", "commits", "Hz", "readers"):
+        table.add_column(name, justify="right" if name in ("commits", "Hz") else "left", overflow="fold")
+    for topic in topics["topics"]:
+        table.add_row(
+            topic["topic"],
+            str(topic.get("type", "-")),
+            str(topic["producer"] or "nobody"),
+            str(topic.get("commits", "-")),
+            f"{topic.get('rate_hz', 0.0):.1f}",
+            ", ".join(topic["readers"]) or "-",
+        )
+    return table
+
+
+def duration_text(seconds: float | None) -> str:
+    """A time span as a short text."""
+    if seconds is None:
+        return "-"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
