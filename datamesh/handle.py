@@ -15,8 +15,10 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from .clock import Timer
-from .payload import Completion
+from .payload import Arena, Completion
 from .policy import CommitPolicy, EqualVersion, Reorder
 from .snapshot import CURRENT_EPOCH, Entry, Snapshot
 from .status import Outcome, Status
@@ -26,6 +28,7 @@ from .window import Window
 __all__ = ["Accessor", "Change", "Input", "Output", "declared_handles"]
 
 T = TypeVar("T")
+P = TypeVar("P")
 _NOTHING: Any = object()
 
 
@@ -60,7 +63,7 @@ class Change(Generic[T]):
     Left as a context manager without a commit, or dropped, it is abandoned, and counted.
     """
 
-    __slots__ = ("_closed", "_completion", "_epoch", "_received_ns", "_value", "_version", "_window")
+    __slots__ = ("_arena", "_closed", "_completion", "_epoch", "_received_ns", "_value", "_version", "_window")
 
     def __init__(self, window: Window[T], epoch: int = CURRENT_EPOCH) -> None:
         self._window = window
@@ -70,6 +73,7 @@ class Change(Generic[T]):
         self._closed = False
         self._received_ns: int | None = None
         self._completion: Completion | None = None
+        self._arena: Arena | None = None
 
     def set_version(self, version: int, received_ns: int | None = None, *, epoch: int | None = None) -> None:
         """Sets the version.
@@ -104,6 +108,39 @@ class Change(Generic[T]):
             raise RuntimeError(f"this change of {self._window.topic!r} was committed or abandoned; allocate another")
         self._value = value
 
+    def array(self, shape: int | tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """An array for the value, not written yet, where its readers see it without a copy.
+
+        That is shared memory where another process reads the topic, else the process's own. What is committed of it
+        may be less: `points[:n]` of an array made for the most points there can be.
+
+        Args:
+            shape: Of the array.
+            dtype: Of its elements.
+        """
+        if self._window.arena is None:
+            return np.empty(shape, dtype)
+        if self._arena is None:
+            self._arena = self._window.arena()
+        return self._arena.array(shape, dtype)
+
+    def allocate(self, payload: type[P], *arguments: Any, **options: Any) -> P:
+        """A payload for the value, not written yet, whose arrays are of `array`.
+
+            cloud = change.allocate(PointCloud, capacity)
+
+        Args:
+            payload: Its type, with a class method `allocate(array, *arguments, **options)`, as `Allocatable` says.
+            arguments: For that method.
+            options: The same.
+
+        Raises:
+            TypeError: The type has no such method.
+        """
+        if not callable(getattr(payload, "allocate", None)):
+            raise TypeError(f"{payload.__name__} has no class method allocate(array, …): make its arrays by `array`")
+        return payload.allocate(self.array, *arguments, **options)  # type: ignore[attr-defined]
+
     def completes_with(self, completion: Completion) -> None:
         """Says that a device is still writing the value, and which event ends it; readers wait for that."""
         self._completion = completion
@@ -123,6 +160,7 @@ class Change(Generic[T]):
 
     def _abandon(self) -> None:
         self._closed = True
+        self._arena = None
         self._window.losses.count(self._window.topic, "abandoned", self._version or 0)
 
 
@@ -305,6 +343,7 @@ class Output(_Handle[T]):
         if value is _NOTHING:
             raise ValueError(f"the change of {window.topic!r} has no value: set `.value` before the commit")
         change._closed = True
+        change._arena = None
         now = window.clock.monotonic_ns()
         received = now if change._received_ns is None else change._received_ns
         epoch = window.epoch if change._epoch == CURRENT_EPOCH else change._epoch

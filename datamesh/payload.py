@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-__all__ = ["Completion", "Freezable", "checksum", "freeze"]
+__all__ = ["Allocatable", "Arena", "Completion", "Freezable", "checksum", "freeze", "host_array", "is_device_array"]
 
 
 @runtime_checkable
@@ -19,6 +19,30 @@ class Freezable(Protocol):
 
     def freeze(self) -> None:
         """Makes every way to write to it raise, as far as its memory can be protected."""
+        ...
+
+
+@runtime_checkable
+class Allocatable(Protocol):
+    """A payload that knows which arrays it consists of, so that a change can build it in place."""
+
+    @classmethod
+    def allocate(cls, array: Callable[..., np.ndarray], *arguments: Any, **options: Any) -> Any:
+        """Makes one, not written yet.
+
+        Args:
+            array: Makes an array of a shape and dtype; of it come all arrays of the payload.
+            arguments: As the payload needs them, such as a capacity.
+            options: The same.
+        """
+        ...
+
+
+class Arena(Protocol):
+    """Memory in which the payload of one change is built."""
+
+    def array(self, shape: Any, dtype: Any) -> np.ndarray:
+        """An array in it, not written yet."""
         ...
 
 
@@ -81,13 +105,23 @@ def freeze(value: Any) -> None:
             freeze(part)
 
 
+def is_device_array(value: Any) -> bool:
+    """Whether it is an array of Warp or torch, on whatever device."""
+    return _kind(type(value)) == "device array"
+
+
+def host_array(value: Any) -> np.ndarray:
+    """An array of Warp or torch as one of NumPy; a copy where it is not on the host."""
+    return (value.detach().cpu() if hasattr(value, "detach") else value).numpy()
+
+
 def checksum(value: Any, start: int = 0) -> int:
     """CRC-32 of the bytes of all arrays in a payload, those on a device too, and of its plain numbers and texts."""
     kind = _kind(type(value))
     if kind == "freezable" and dataclasses.is_dataclass(value):
         kind = "dataclass"
     if kind == "device array":
-        value = (value.detach().cpu() if hasattr(value, "detach") else value).numpy()
+        value = host_array(value)
         kind = "array"
     if kind == "array":
         if value.dtype.hasobject:

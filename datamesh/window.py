@@ -14,7 +14,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from .clock import Clock, SystemClock
 from .counters import LossCounters
-from .payload import checksum, freeze
+from .payload import Arena, checksum, freeze
 from .policy import CommitPolicy, EqualVersion, Reorder
 from .snapshot import CURRENT_EPOCH, Entry, Snapshot, State
 from .status import Status
@@ -73,6 +73,8 @@ class Window(Generic[T]):
         self.losses = losses if losses is not None else LossCounters()
         self.clock = clock if clock is not None else SystemClock()
         self.check = check
+        self.arena: Callable[[], Arena] | None = None
+        """Gives the memory in which a payload is built that other processes read; None: this process's own."""
         self._state: State[T] = State.empty(0)
         self._lock = threading.Lock()
         # Held from a commit to the end of its callbacks: subscribers see the commits in their order.

@@ -6,6 +6,8 @@ A value is one byte that says its kind, then its content, little-endian:
     a array (dtype, number of dimensions, shape, bytes in C order) · n NumPy scalar (dtype, bytes)
     t tuple · l list · d dict (count, then the values, or keys and values in their order)
     m message: the name of its type, count of fields, then name and value of each
+    r array by reference (dtype, number of dimensions, shape, number of a memory, offset in it), where `encode` is given
+      a place for arrays; who decodes gives the memories
 
 Lengths and counts are 4 bytes, the sizes of arrays 8. The same value makes the same bytes, so that bytes, or a hash of
 them, can be compared in place of values. Nothing is ever executed: only registered types are made, by their fields.
@@ -18,15 +20,18 @@ import enum
 import json
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
+from ..payload import host_array, is_device_array
+
 __all__ = ["Decoder", "MessageType", "decode", "encode", "message", "message_type"]
 
 T = TypeVar("T", bound=type)
+Place = Callable[[np.ndarray], "tuple[int, int] | None"]
 
 _DEEPEST = 64
 _INT = struct.Struct("<q")
@@ -106,26 +111,28 @@ def _describe(cls: type, name: str) -> MessageType:
     raise TypeError(f"{cls.__name__} is neither a dataclass nor a named tuple nor an enumeration: it has no fields")
 
 
-def encode(value: Any) -> bytes:
+def encode(value: Any, place: Place | None = None) -> bytes:
     """The bytes of a value.
 
     Args:
         value: None, bool, int, float, str, bytes, arrays and scalars of NumPy, tuples, lists, dicts, and messages.
+        place: Says where an array lies that is not to be among the bytes: number of a memory that `decode` is given,
+            and offset in it; None where it is to be. Arrays on a device then count too, as their copies on the host.
 
     Raises:
         TypeError: It holds something else; says where, and of which type.
     """
     parts: list[Any] = []
-    _put(value, parts, 0)
+    _put(value, parts, 0, place)
     return b"".join(parts)
 
 
-def _put(value: Any, parts: list[Any], depth: int) -> None:
+def _put(value: Any, parts: list[Any], depth: int, place: Place | None = None) -> None:
     if depth > _DEEPEST:
         raise TypeError(f"it is nested deeper than {_DEEPEST} levels")
     cls = type(value)
     if cls is np.ndarray:
-        _put_array(value, parts)
+        _put_array(value, parts, place)
     elif value is None:
         parts.append(b"N")
     elif cls is bool:
@@ -144,33 +151,35 @@ def _put(value: Any, parts: list[Any], depth: int) -> None:
     elif cls is tuple or cls is list:
         parts.append((b"t" if cls is tuple else b"l") + _COUNT.pack(len(value)))
         for index, item in enumerate(value):
-            _put_at(f"[{index}]", item, parts, depth)
+            _put_at(f"[{index}]", item, parts, depth, place)
     elif cls is dict:
         parts.append(b"d" + _COUNT.pack(len(value)))
         for key, item in value.items():
-            _put_at("a key", key, parts, depth)
-            _put_at(f"[{key!r}]", item, parts, depth)
+            _put_at("a key", key, parts, depth, None)
+            _put_at(f"[{key!r}]", item, parts, depth, place)
     elif (kind := _by_class.get(cls)) is not None:
         _put_bytes(b"m", kind.name.encode(), parts)
         parts.append(_COUNT.pack(len(kind.fields)))
         for name in kind.fields:
             _put_bytes(b"", name.encode(), parts)
-            _put_at(f"{cls.__name__}.{name}", getattr(value, name), parts, depth)
+            _put_at(f"{cls.__name__}.{name}", getattr(value, name), parts, depth, place)
     elif isinstance(value, np.generic) and not value.dtype.hasobject:
         parts.append(b"n")
         _put(_dtype_text(value.dtype), parts, depth + 1)
         _put_bytes(b"", value.tobytes(), parts)
+    elif place is not None and is_device_array(value):
+        _put_array(host_array(value), parts, place)
     else:
         raise TypeError(
             f"{cls.__module__}.{cls.__qualname__} is not a message: register it with warploom.datamesh.messages.message"
         )
 
 
-def _put_at(place: str, value: Any, parts: list[Any], depth: int) -> None:
+def _put_at(where: str, value: Any, parts: list[Any], depth: int, place: Place | None) -> None:
     try:
-        _put(value, parts, depth + 1)
+        _put(value, parts, depth + 1, place)
     except TypeError as error:
-        raise TypeError(f"{place}: {error}") from None
+        raise TypeError(f"{where}: {error}") from None
 
 
 def _put_bytes(kind: bytes, content: bytes, parts: list[Any]) -> None:
@@ -180,12 +189,16 @@ def _put_bytes(kind: bytes, content: bytes, parts: list[Any]) -> None:
     parts.append(content)
 
 
-def _put_array(array: np.ndarray, parts: list[Any]) -> None:
+def _put_array(array: np.ndarray, parts: list[Any], place: Place | None) -> None:
     if array.dtype.hasobject:
         raise TypeError(f"an array of {array.dtype}: Python objects have no bytes of their own")
-    parts.append(b"a")
+    where = None if place is None or not array.size else place(array)
+    parts.append(b"a" if where is None else b"r")
     _put(_dtype_text(array.dtype), parts, 0)
     parts.append(_COUNT.pack(array.ndim) + b"".join(_SIZE.pack(size) for size in array.shape))
+    if where is not None:
+        parts.append(_COUNT.pack(where[0]) + _SIZE.pack(where[1]))
+        return
     # A view of the memory: it is copied once, when the parts are joined. Dates have no buffer, bytes have.
     parts.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.size else b"")
 
@@ -219,13 +232,18 @@ def _fields_of(fields: Any) -> list[tuple]:
     return result
 
 
-def decode(data: bytes | memoryview) -> Any:
-    """The value that was encoded; arrays are copies with memory of their own.
+def decode(data: bytes | memoryview, memories: Sequence[np.ndarray] = ()) -> Any:
+    """The value that was encoded; arrays are copies with memory of their own, those by reference are views.
+
+    Args:
+        data: The bytes.
+        memories: Where arrays by reference lie, each of shape (size,), uint8.
 
     Raises:
-        ValueError: The bytes are truncated or damaged, or hold a message of a type that is not registered.
+        ValueError: The bytes are truncated or damaged, refer to memory that is not there, or hold a message of a type
+            that is not registered.
     """
-    decoder = Decoder(data)
+    decoder = Decoder(data, memories)
     value = decoder.value()
     if decoder.position != len(decoder.data):
         raise ValueError(f"{len(decoder.data) - decoder.position} bytes are left behind the value")
@@ -235,9 +253,10 @@ def decode(data: bytes | memoryview) -> Any:
 class Decoder:
     """Reads values one after the other; never beyond the end, and never more than the bytes can hold."""
 
-    def __init__(self, data: bytes | memoryview) -> None:
+    def __init__(self, data: bytes | memoryview, memories: Sequence[np.ndarray] = ()) -> None:
         self.data = memoryview(data).cast("B")
         self.position = 0
+        self._memories = memories
 
     def _take(self, size: int) -> memoryview:
         if size > len(self.data) - self.position:
@@ -289,17 +308,31 @@ class Decoder:
             result[key] = self.value(depth)
         return result
 
-    def _array(self, depth: int) -> np.ndarray:
+    def _form(self, depth: int) -> tuple[np.dtype, tuple[int, ...], int]:
+        """Type, shape, and number of bytes of an array."""
         dtype = _dtype_of(self.value(depth))
         dimensions = self._count()
         if dimensions > 32:
             raise ValueError(f"an array of {dimensions} dimensions")
         shape = tuple(_SIZE.unpack(self._take(8))[0] for _ in range(dimensions))
         size = math.prod(shape)
-        data = self._take(size * dtype.itemsize)
         if size == 0 and max(shape) >= 1 << 62:
             raise ValueError(f"an array of shape {shape}")
-        return np.frombuffer(data, dtype).reshape(shape).copy()
+        return dtype, shape, size * dtype.itemsize
+
+    def _array(self, depth: int) -> np.ndarray:
+        dtype, shape, size = self._form(depth)
+        return np.frombuffer(self._take(size), dtype).reshape(shape).copy()
+
+    def _reference(self, depth: int) -> np.ndarray:
+        dtype, shape, size = self._form(depth)
+        number, offset = self._count(), _SIZE.unpack(self._take(8))[0]
+        if number >= len(self._memories):
+            raise ValueError(f"an array in memory {number}, of which there are {len(self._memories)} here")
+        memory = self._memories[number]
+        if offset + size > len(memory):
+            raise ValueError(f"an array at {offset} to {offset + size} of a memory of {len(memory)} bytes")
+        return memory[offset : offset + size].view(dtype).reshape(shape)
 
     def _scalar(self, depth: int) -> Any:
         dtype = _dtype_of(self.value(depth))
@@ -340,6 +373,7 @@ _READERS: Mapping[bytes, Callable[[Decoder, int], Any]] = {
     b"l": Decoder._items,
     b"d": Decoder._dict,
     b"a": Decoder._array,
+    b"r": Decoder._reference,
     b"n": Decoder._scalar,
     b"m": Decoder._message,
 }

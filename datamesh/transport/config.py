@@ -1,0 +1,50 @@
+"""How topics go from process to process."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+__all__ = ["SharedMemoryConfig", "ZenohConfig"]
+
+
+class SharedMemoryConfig(BaseModel):
+    """Topics between the processes of a host."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    memory_bytes: int = Field(1 << 32, ge=4096)
+    """Address space of a topic, a power of two; memory is taken as it is used [B]."""
+    queue: int = Field(8, ge=1, le=128)
+    """How many payloads a reader may have in its queue, beside those that its window keeps."""
+    history: int = Field(8, ge=0, le=1024)
+    """How many of the newest data a reader is sent that connects later."""
+    retry_ms: float = Field(20.0, gt=0.0)
+    """How long a reader waits before it looks for its producer again [ms]."""
+
+    @field_validator("memory_bytes")
+    @classmethod
+    def _is_a_power_of_two(cls, size: int) -> int:
+        if size & (size - 1):
+            raise ValueError(f"expected a power of two, such as {1 << size.bit_length()}")
+        return size
+
+
+class ZenohConfig(BaseModel):
+    """Topics between hosts, over zenoh."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mode: str = Field("peer", pattern="^(peer|client)$")
+    """peer: hosts find each other; client: all goes by way of a router."""
+    connect: tuple[str, ...] = ()
+    """Endpoints to connect to, such as `tcp/192.168.1.7:7447`."""
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen at, such as `tcp/0.0.0.0:7447`; none: zenoh's own choice."""
+    scouting: bool = True
+    """Whether hosts look for each other by multicast."""
+    domain: str = Field("", pattern=r"^[^*$?#/]*$")
+    """Hosts of one domain hear each other; by default the name of the node."""
+    queue: int = Field(8, ge=1, le=1024)
+    """How many data may wait for a reader; the oldest is dropped, counted."""
+    history: bool = True
+    """Whether a reader that comes later is given the newest datum."""

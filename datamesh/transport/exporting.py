@@ -1,0 +1,434 @@
+"""The writer's side: a topic of this process for readers in other processes of the host.
+
+A commit is encoded once, its arrays by reference into slabs, and told to each reader as one message of its own socket.
+Payloads that were built in slabs are not copied; the others are, and counted. Nothing waits for a reader, unless its
+backlog blocks its producer: what does not fit into its queue is dropped, and counted. A reader that dies, however, is
+noticed by the end of its socket, which the kernel closes, and what it held is free again.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import socket
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..messages import encode
+from ..snapshot import Entry
+from ..window import Window
+from .config import SharedMemoryConfig
+from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
+from .slabs import Lease, Slab, SlabArena, SlabPool
+from .wire import COMMIT, INLINE, MESSAGE, RELEASE, SETTLE, Event, pack_event, pack_greeting, read_greeting
+
+__all__ = ["ExportService", "Exporter"]
+
+_log = logging.getLogger(__name__)
+
+_SMALL = 1024
+"""Arrays up to so many bytes go with the message, unless they are in a slab already."""
+_NAMES = 256
+"""Of how many readers it is known what they were sent, for when they come back."""
+
+
+class ExportService:
+    """The thread that lets readers of all exported topics in, and notices when they go. It sleeps otherwise."""
+
+    def __init__(self, name: str) -> None:
+        """Starts the thread.
+
+        Args:
+            name: Of the thread.
+        """
+        self._epoll = select.epoll()
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._handlers: dict[int, Callable[[], None]] = {}
+        self._epoll.register(self._wake, select.EPOLLIN)
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def watch(self, one: socket.socket, events: int, handler: Callable[[], None]) -> None:
+        """Calls the handler when one of the events is there. Closing the socket ends it."""
+        fd = one.fileno()
+        known = fd in self._handlers
+        self._handlers[fd] = handler
+        try:
+            self._epoll.modify(fd, events) if known else self._epoll.register(fd, events)
+        except FileNotFoundError:  # the number was that of a socket closed since
+            self._epoll.register(fd, events)
+
+    def _run(self) -> None:
+        while not self._stopping:
+            for fd, _ in self._epoll.poll():
+                handler = self._handlers.get(fd)
+                if handler is None:
+                    continue
+                try:
+                    handler()
+                except Exception:  # the other readers are to be served all the same
+                    _log.exception("a reader could not be served")
+
+    def stop(self) -> None:
+        """Ends the thread."""
+        self._stopping = True
+        os.eventfd_write(self._wake, 1)
+        self._thread.join()
+        self._epoll.close()
+        os.close(self._wake)
+
+
+class _Reader:
+    """A connection to a process that reads the topic."""
+
+    __slots__ = ("blocks", "held", "most", "name", "number", "reached", "slabs", "socket")
+
+    def __init__(self, connection: socket.socket, name: str, most: int, blocks: bool) -> None:
+        self.socket = connection
+        self.name = name
+        self.most = most
+        """How many payloads it may hold."""
+        self.blocks = blocks
+        self.reached = (-1, -1)
+        """The newest that it was sent: epoch and version."""
+        self.number = 0
+        """Of events, dropped ones too."""
+        self.held = 0
+        self.slabs: Counter[int] = Counter()
+        """Those that it holds, by offset, and how often."""
+
+
+class _NoRoom(Exception):  # noqa: N818  (it is no error: the datum is dropped and counted)
+    """The memory of the topic is full."""
+
+
+class Exporter:
+    """Sends one topic."""
+
+    def __init__(
+        self,
+        window: Window[Any],
+        service: ExportService,
+        *,
+        node: str,
+        name: str,
+        config: SharedMemoryConfig | None = None,
+    ) -> None:
+        """Begins to export; payloads of the window can be built in shared memory from here on.
+
+        Args:
+            window: Of the topic.
+            service: Lets readers in.
+            node: Whose processes read it.
+            name: Of this process, for messages.
+            config: Sizes.
+
+        Raises:
+            ConfigError: Another process exports the topic.
+        """
+        self._config = config or SharedMemoryConfig()
+        self._window = window
+        self._service = service
+        self._node = node
+        self._name = name
+        self._counts: Counter[str] = Counter()
+        self._lock = threading.RLock()
+        self._readers: list[_Reader] = []
+        self._reached: dict[str, tuple[int, int]] = {}
+        self._stopped = False
+        self._last_arena: SlabArena | None = None
+        self._usual_copy = 0
+        self._listener = listen(node, window.topic)
+        try:
+            self._order = OrderFile(node, window.topic)
+            self._pool = SlabPool(self._config.memory_bytes)
+        except BaseException:
+            self._listener.close()
+            unlisten(node, window.topic)
+            raise
+        window.arena = self._arena
+        self._unsubscribe = window.subscribe(self._on_commit, self._on_settle)
+        service.watch(self._listener, select.EPOLLIN, self._accept)
+
+    def counters(self) -> Mapping[str, int]:
+        """What was sent, copied and dropped so far, and how many read."""
+        with self._lock:
+            return {**self._counts, "readers": len(self._readers), "slabs": self._pool.used}
+
+    def stop(self) -> None:
+        """Ends the export. What readers hold stays theirs."""
+        self._stopped = True
+        self._window.arena = None
+        self._unsubscribe()
+        with self._lock:
+            unlisten(self._node, self._window.topic)
+            self._listener.close()
+            for reader in tuple(self._readers):
+                self._drop(reader)
+            self._pool.close()
+            self._order.close()
+
+    # Memory
+
+    def _arena(self) -> SlabArena:
+        usual = self._last_arena.size if self._last_arena is not None else 0
+        self._last_arena = SlabArena(self._lease, usual, partial(self._count, "no_memory"))
+        return self._last_arena
+
+    def _lease(self, size: int) -> Lease | None:
+        with self._lock:
+            if self._stopped:
+                return None
+            for reader in tuple(self._readers):
+                self._collect(reader)
+            slab = self._pool.take(size)
+            return None if slab is None else self._pool.lease(slab)
+
+    def _count(self, what: str) -> None:
+        with self._lock:
+            self._counts[what] += 1
+
+    # Commits
+
+    def _on_commit(self, entry: Entry) -> None:
+        with self._lock:
+            if self._stopped:
+                return
+            epoch = self._order.epoch(entry.epoch, entry.version)
+            self._counts["commits"] += 1
+            if self._readers:
+                newest = self._window.snapshot(entry.epoch).versions[-1:] == (entry.version,)
+                self._tell(entry, epoch, newest, self._readers)
+
+    def _on_settle(self, version: int, epoch: int) -> None:
+        with self._lock:
+            if self._stopped:
+                return
+            epoch = self._order.epoch(epoch, version)
+            for reader in tuple(self._readers):
+                self._send(reader, Event(SETTLE, 0, epoch, version, 0, 0))
+
+    def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]) -> None:
+        """Sends a datum to readers."""
+        try:
+            event, slabs, leases = self._encode(entry, epoch, newest)
+        except _NoRoom:
+            self._lose("no_memory", entry.version, readers)
+            return
+        except (TypeError, ValueError) as error:
+            if not self._counts["not_encodable"]:
+                _log.warning("%s: version %d is not sent: %s", self._window.topic, entry.version, error)
+            self._lose("not_encodable", entry.version, readers)
+            return
+        for reader in tuple(readers):
+            if self._send(reader, event, slabs):
+                reader.reached = max(reader.reached, (epoch, entry.version))
+        del leases  # until here they hold the slabs that were copied to
+
+    def _lose(self, reason: str, version: int, readers: list[_Reader]) -> None:
+        for reader in readers:
+            reader.number += 1
+        self._counts[reason] += len(readers)
+        self._window.losses.count(self._window.topic, f"link_{reason}", version, len(readers))
+
+    def _encode(self, entry: Entry, epoch: int, newest: bool) -> tuple[Event, list[Slab], list[Any]]:
+        """A datum as an event, the slabs that it is in, and what holds those that were taken for it.
+
+        Raises:
+            _NoRoom: There is no room to copy it to.
+            TypeError: It has no form as a message.
+        """
+        slabs: list[Slab] = []
+        numbers: dict[int, int] = {}
+        leases: list[Any] = []
+
+        def lease(size: int) -> Lease:
+            found = self._lease(size)
+            if found is None:
+                raise _NoRoom
+            leases.append(found)
+            return found
+
+        def number_of(slab: Slab) -> int:
+            if slab.offset not in numbers:
+                numbers[slab.offset] = len(slabs)
+                slabs.append(slab)
+            return numbers[slab.offset]
+
+        arena = SlabArena(lease, self._usual_copy, lambda: None)
+
+        def place(array: np.ndarray) -> tuple[int, int] | None:
+            found = self._pool.locate(array)
+            if found is None:
+                if array.nbytes <= _SMALL:
+                    return None
+                copy = arena.array(array.shape, array.dtype)
+                np.copyto(copy, array)
+                self._counts["copied_bytes"] += array.nbytes
+                found = self._pool.locate(copy)
+                assert found is not None
+            return number_of(found[0]), found[1]
+
+        value = entry.read()  # on the host, so what a device still writes is waited for
+        body: bytes | memoryview = encode(value, place)
+        size = 0
+        self._counts["copied"] += arena.size > 0
+        self._usual_copy = arena.size
+        if len(body) > INLINE:
+            one = lease(len(body))
+            one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
+            slabs.append(one.key)
+            size, body = len(body), b""
+        parts = tuple((slab.offset, slab.size) for slab in slabs)
+        stamps = entry.received_ns, entry.committed_ns
+        event = Event(COMMIT, 0, epoch, entry.version, *stamps, entry.triggers, newest, parts, body, size)
+        return event, slabs, leases
+
+    # Readers
+
+    def _accept(self) -> None:
+        with suppress(BlockingIOError):
+            connection, _ = self._listener.accept()
+            keep_from_children(connection)
+            connection.setblocking(False)
+            if peer_of(connection)[1] != os.getuid():
+                connection.close()
+                return
+            self._service.watch(connection, select.EPOLLIN | select.EPOLLRDHUP, lambda: self._greet(connection))
+
+    def _greet(self, connection: socket.socket) -> None:
+        """Lets a reader in that has said hello."""
+        try:
+            data = connection.recv(MESSAGE)
+            if not data:
+                connection.close()
+                return
+            wanted = (("topic", str), ("reader", str), ("capacity", int), ("blocks", bool))
+            hello = read_greeting(data, wanted)
+            if hello["topic"] != self._window.topic:
+                raise ValueError(f"it wants topic {hello['topic']!r} here, where {self._window.topic!r} is")
+        except BlockingIOError:
+            return
+        except (OSError, ValueError) as error:
+            _log.warning("%s: a reader is turned away: %s", self._window.topic, error)
+            with suppress(OSError):
+                connection.send(pack_greeting({"refused": str(error)}))
+            connection.close()
+            return
+        most = max(1, min(hello["capacity"], 1 << 16)) + self._config.queue
+        reader = _Reader(connection, hello["reader"], most, hello["blocks"])
+        with self._lock:
+            if self._stopped:
+                connection.close()
+                return
+            welcome = {"writer": self._name, "topic": self._window.topic, "memory": self._pool.region.size}
+            try:
+                socket.send_fds(connection, [pack_greeting(welcome)], [self._pool.fd])
+            except OSError:
+                connection.close()
+                return
+            self._counts["connections"] += 1
+            self._service.watch(connection, select.EPOLLRDHUP, lambda: self._gone(reader))
+            self._readers.append(reader)
+            self._send_history(reader)
+
+    def _send_history(self, reader: _Reader) -> None:
+        """Sends what a new reader has missed; it triggers, unless it was sent to the reader's life before."""
+        snapshot = self._window.snapshot()
+        reached = self._reached.pop(reader.name, (-1, -1))
+        for index in range(max(0, len(snapshot) - self._config.history), len(snapshot)):
+            entry = snapshot.entry(index)
+            epoch = self._order.epoch(entry.epoch, entry.version)
+            triggers = entry.triggers and (epoch, entry.version) > reached
+            self._tell(entry._replace(triggers=triggers), epoch, False, [reader])
+        reader.reached = max(reader.reached, reached)
+
+    def _gone(self, reader: _Reader) -> None:
+        with self._lock:
+            self._collect(reader)
+
+    def _send(self, reader: _Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
+        """Sends an event, if the reader has room; one that blocks its producer is waited for. Tells whether it did."""
+        reader.number += 1
+        data = pack_event(event._replace(number=reader.number))
+        while not self._try_send(reader, data, slabs):
+            if reader.socket.fileno() < 0:
+                return False
+            if not reader.blocks or self._stopped:
+                self._counts["slow"] += 1
+                self._window.losses.count(self._window.topic, "link_slow", event.version)
+                return False
+            poll = select.poll()
+            poll.register(reader.socket, select.POLLIN | (0 if slabs and self._is_full(reader) else select.POLLOUT))
+            poll.poll(50)
+        return True
+
+    def _is_full(self, reader: _Reader) -> bool:
+        return reader.held >= reader.most
+
+    def _try_send(self, reader: _Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
+        if slabs and self._is_full(reader):
+            self._collect(reader)
+            if self._is_full(reader):
+                return False
+        try:
+            reader.socket.send(data)
+        except BlockingIOError:
+            self._collect(reader)
+            return False
+        except OSError:
+            self._drop(reader)
+            return False
+        self._counts["sent"] += 1
+        self._counts["sent_bytes"] += len(data)
+        for slab in slabs:
+            slab.holders += 1
+            reader.slabs[slab.offset] += 1
+            reader.held += 1
+        return True
+
+    def _collect(self, reader: _Reader) -> None:
+        """Takes back the slabs that a reader has let go of; all of them where it is gone."""
+        while True:
+            try:
+                data = reader.socket.recv(MESSAGE)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self._drop(reader)
+                return
+            for (offset,) in RELEASE.iter_unpack(data[: len(data) // RELEASE.size * RELEASE.size]):
+                if reader.slabs[offset] > 0:  # what it does not hold, it cannot let go of
+                    self._let_go(reader, offset, 1)
+
+    def _let_go(self, reader: _Reader, offset: int, times: int) -> None:
+        slab = self._pool.at(offset)
+        reader.slabs[offset] -= times
+        if not reader.slabs[offset]:
+            del reader.slabs[offset]
+        reader.held -= times
+        for _ in range(times):
+            self._pool.release(slab)
+
+    def _drop(self, reader: _Reader) -> None:
+        """Forgets a reader that is gone, and takes back what it held."""
+        if reader not in self._readers:
+            return
+        self._readers.remove(reader)
+        reader.socket.close()
+        self._reached[reader.name] = max(reader.reached, self._reached.pop(reader.name, reader.reached))
+        if len(self._reached) > _NAMES:
+            del self._reached[next(iter(self._reached))]
+        for offset, times in list(reader.slabs.items()):
+            self._let_go(reader, offset, times)
+        self._counts["disconnections"] += 1

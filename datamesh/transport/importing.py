@@ -1,0 +1,255 @@
+"""The reader's side: a topic of another process of the host in a window of this one.
+
+Arrays are read-only views of the writer's memory. Once the last of a payload is gone, because the window has evicted it
+and no snapshot shows it, the writer is told that it may use the slab again.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import socket
+import threading
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Any
+
+from ...errors import SourceError
+from ..messages import decode
+from ..policy import CommitPolicy, EqualVersion
+from ..snapshot import Entry
+from ..window import Window
+from .config import SharedMemoryConfig
+from .places import connect, peer_of
+from .slabs import Lease, Region
+from .wire import MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
+
+__all__ = ["Importer", "publish"]
+
+_log = logging.getLogger(__name__)
+
+
+class _Connection:
+    """A connection to the writer, and its memory."""
+
+    def __init__(self, one: socket.socket, region: Region, writer: str) -> None:
+        self.socket = one
+        self.region = region
+        self.writer = writer
+        self._waiting: deque[bytes] = deque()
+
+    def lease(self, slab: tuple[int, int]) -> Lease:
+        """A slab, which the writer is told of when it is no longer needed."""
+        return Lease(self.region, *slab, slab[0], self._let_go)
+
+    def _let_go(self, offset: int) -> None:
+        # Called wherever the last array of a slab ends, in whatever thread: it takes no lock and never waits.
+        self._waiting.append(RELEASE.pack(offset))
+        self.tell()
+
+    def tell(self) -> None:
+        """Tells the writer which slabs are no longer needed."""
+        while self._waiting:
+            try:
+                one = self._waiting.popleft()
+            except IndexError:  # another thread was faster
+                return
+            try:
+                self.socket.send(one, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            except OSError as error:
+                if error.errno in (errno.EAGAIN, errno.ENOBUFS):  # the next one, or the next datum, tries again
+                    self._waiting.append(one)
+                return
+
+
+class Importer:
+    """Receives one topic, in a thread of its own, which looks for the producer as long as there is none."""
+
+    def __init__(
+        self,
+        window: Window[Any],
+        *,
+        node: str,
+        name: str,
+        config: SharedMemoryConfig | None = None,
+        blocks: bool = False,
+    ) -> None:
+        """Prepares; `start` begins.
+
+        Args:
+            window: Of the topic, in this process; nobody else commits to it.
+            node: Whose process exports it.
+            name: Of this process; the same in its next life.
+            config: Sizes.
+            blocks: Whether the producer waits where this process is not ready for more.
+        """
+        self._config = config or SharedMemoryConfig()
+        self._window = window
+        self._node = node
+        self._name = name
+        self._blocks = blocks
+        self._counts: Counter[str] = Counter()
+        self._stopping = threading.Event()
+        self._connection: _Connection | None = None
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._complaint = ""
+
+    def start(self) -> None:
+        """Begins to look for the producer, and to receive."""
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._run, name=f"import {self._window.topic}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends receiving. What was received stays."""
+        self._stopping.set()
+        with self._lock:
+            if self._connection is not None:
+                self._connection.socket.shutdown(socket.SHUT_RDWR)
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def counters(self) -> Mapping[str, int]:
+        """What was received, and what not."""
+        return {**self._counts, "connected": int(self._connection is not None)}
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                connection = self._connect()
+            except (OSError, ValueError, SourceError) as error:
+                connection = None
+                if str(error) != self._complaint:  # once, not at every try
+                    _log.warning("%s: %s", self._window.topic, error)
+                    self._complaint = str(error)
+            if connection is None:
+                self._stopping.wait(self._config.retry_ms / 1e3)
+                continue
+            self._complaint = ""
+            self._counts["connections"] += 1
+            try:
+                self._receive(connection)
+            finally:
+                with self._lock:
+                    self._connection = None
+                    connection.socket.close()
+                del connection
+
+    def _connect(self) -> _Connection | None:
+        one = connect(self._node, self._window.topic)
+        if one is None:
+            return None
+        try:
+            if peer_of(one)[1] != os.getuid():
+                raise SourceError(
+                    f"topic {self._window.topic!r} is exported by another user, whom this one must not trust"
+                )
+            one.settimeout(2.0)
+            hello = {
+                "topic": self._window.topic,
+                "reader": self._name,
+                "capacity": self._window.capacity,
+                "blocks": self._blocks,
+            }
+            one.send(pack_greeting(hello))
+            data, fds, _, _ = socket.recv_fds(one, MESSAGE, 1, socket.MSG_CMSG_CLOEXEC)
+            try:
+                connection = self._welcomed(one, data, fds)
+            finally:
+                for fd in fds:
+                    os.close(fd)
+            one.settimeout(None)
+            with self._lock:
+                if self._stopping.is_set():
+                    one.close()
+                    return None
+                self._connection = connection
+            return connection
+        except TimeoutError:
+            one.close()
+            raise SourceError(f"the process that exports {self._window.topic!r} does not answer") from None
+        except BaseException:
+            one.close()
+            raise
+
+    def _welcomed(self, one: socket.socket, data: bytes, fds: list[int]) -> _Connection | None:
+        if not data:  # it ended just now
+            raise SourceError(f"the process that exports {self._window.topic!r} is gone again")
+        welcome = read_greeting(data, ())
+        if "refused" in welcome:
+            raise SourceError(f"the process that exports {self._window.topic!r} refuses: {welcome['refused']}")
+        welcome = read_greeting(data, (("writer", str), ("topic", str), ("memory", int)))
+        if len(fds) != 1:
+            raise SourceError(f"the process that exports {self._window.topic!r} sent no memory")
+        return _Connection(one, Region(fds[0], welcome["memory"], writable=False), welcome["writer"])
+
+    def _receive(self, connection: _Connection) -> None:
+        """Receives until the writer or this reader ends."""
+        number = 0
+        while True:
+            try:
+                data = connection.socket.recv(MESSAGE)
+            except OSError:
+                return
+            if not data:
+                return
+            connection.tell()
+            try:
+                event = read_event(data, connection.region.size)
+            except ValueError as error:
+                # The numbers of what comes next cannot be trusted either: both ends begin anew.
+                self._damaged(0, error)
+                return
+            missing, number = event.number - number - 1, event.number
+            if missing > 0:
+                self._counts["missed"] += missing
+                self._window.losses.count(self._window.topic, "link_missed", event.version, missing)
+            self._counts["received"] += 1
+            self._counts["received_bytes"] += len(data)
+            if event.kind == SETTLE:
+                self._window.settle(event.version, event.epoch)
+                continue
+            try:
+                value = _value(connection, event)
+            except ValueError as error:
+                self._damaged(event.version, error)
+                continue
+            publish(self._window, event, value)
+            del value
+
+    def _damaged(self, version: int, error: ValueError) -> None:
+        if not self._counts["damaged"]:
+            _log.error("%s: version %d cannot be read: %s", self._window.topic, version, error)
+        self._counts["damaged"] += 1
+        self._window.losses.count(self._window.topic, "link_damaged", version)
+
+
+def _value(connection: _Connection, event: Event) -> Any:
+    """The payload of a commit: arrays are views of the writer's memory.
+
+    Raises:
+        ValueError: It is damaged, or of a type that is not registered.
+    """
+    memories = [connection.lease(slab).bytes() for slab in event.slabs]
+    body = memories[-1][: event.body_size].tobytes() if event.body_size else event.body
+    return decode(body, memories)
+
+
+def publish(window: Window[Any], event: Event, value: Any) -> None:
+    """Commits what another process has committed, to the same effect.
+
+    Args:
+        window: Of the topic.
+        event: The commit there.
+        value: Its payload.
+    """
+    snapshot = window.snapshot(event.epoch)
+    index = snapshot.version_index(event.version)
+    if index >= 0 and snapshot.entry(index).committed_ns == event.committed_ns:
+        return  # sent again, after the connection was lost
+    entry = Entry(event.version, value, event.received_ns, event.committed_ns, event.epoch, event.triggers)
+    policy = CommitPolicy.OVERWRITE if event.newest else CommitPolicy.INSERT_SORTED
+    window.commit(policy, entry, EqualVersion.REPLACE, None if event.newest else event.triggers)

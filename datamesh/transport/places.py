@@ -1,0 +1,246 @@
+"""Where the links of a node meet: a folder of its user's own, with a socket for each topic that is exported.
+
+    <run folder>/links/<topic>.socket   listens while the producer lives
+    <run folder>/links/<topic>.order    epoch and newest version of what was sent, for the producer's next life
+
+Memory has no name (`slabs`), so these are all that a killed process leaves behind; `reap` removes them.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import socket
+import stat
+import struct
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+from ...errors import ConfigError
+
+__all__ = [
+    "OrderFile",
+    "connect",
+    "exported_topics",
+    "keep_from_children",
+    "listen",
+    "peer_of",
+    "reap",
+    "run_folder",
+    "unlisten",
+]
+
+_sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
+
+
+def keep_from_children(one: socket.socket) -> None:
+    """Closes a socket in children that are forked, in whose hands it would outlive this process."""
+    _sockets.add(one)
+
+
+def _close_inherited() -> None:
+    for one in list(_sockets):
+        one.close()
+
+
+os.register_at_fork(after_in_child=_close_inherited)
+
+_CREDENTIALS = struct.Struct("3i")
+_ORDER = struct.Struct("<8sQQ")
+_MAGIC = b"warploom"
+
+
+def run_folder(node: str) -> Path:
+    """The folder of a node's runtime files; made where there is none, for its user alone.
+
+    `$WARPLOOM_RUN/<node>`, else `$XDG_RUNTIME_DIR/warploom/<node>`, else `/tmp/warploom-<uid>/<node>`.
+
+    Raises:
+        ConfigError: It cannot be made, or belongs to somebody else; or the name is none of a folder.
+    """
+    if not node or node in (".", "..") or "/" in node or "\0" in node:
+        raise ConfigError(f"{node!r} cannot be the name of a node: it becomes the name of a folder")
+    own, runtime = os.environ.get("WARPLOOM_RUN"), os.environ.get("XDG_RUNTIME_DIR")
+    base = Path(own) if own else Path(runtime) / "warploom" if runtime else Path(f"/tmp/warploom-{os.getuid()}")
+    folder = base / node
+    try:
+        for one in (base, folder):
+            one.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.lstat()
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made: {error.strerror or error}; set WARPLOOM_RUN") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or base.stat().st_uid != os.getuid():
+        raise ConfigError(f"{folder}: is not a folder of this user alone; set WARPLOOM_RUN to another")
+    return folder
+
+
+def _links(node: str) -> Path:
+    folder = run_folder(node) / "links"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
+def _path(node: str, topic: str, kind: str) -> Path:
+    name = f"{quote(topic, safe='')}.{kind}"
+    if not topic or len(name) > 200:
+        raise ConfigError(f"topic {topic!r} cannot be exported: its name becomes that of a file")
+    return _links(node) / name
+
+
+@contextmanager
+def _address(path: Path) -> Iterator[str]:
+    """The address of a socket; a long path by way of its folder, as addresses have at most 107 bytes."""
+    if len(os.fsencode(path)) <= 100:
+        yield os.fspath(path)
+        return
+    fd = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{fd}/{path.name}"
+    finally:
+        os.close(fd)
+
+
+def connect(node: str, topic: str) -> socket.socket | None:
+    """A connection to who exports a topic; None where nobody does."""
+    return _connected(_path(node, topic, "socket"))
+
+
+def _connected(path: Path) -> socket.socket | None:
+    one = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    keep_from_children(one)
+    try:
+        with _address(path) as address:
+            one.connect(address)
+    except (FileNotFoundError, ConnectionRefusedError, ConnectionResetError, BlockingIOError):
+        one.close()
+        return None
+    except BaseException:
+        one.close()
+        raise
+    return one
+
+
+def listen(node: str, topic: str) -> socket.socket:
+    """The socket at which readers of a topic connect. It takes the place of one whose process is dead.
+
+    Raises:
+        ConfigError: A process that lives exports the topic.
+    """
+    path = _path(node, topic, "socket")
+    other = _connected(path)
+    if other is not None:
+        pid = peer_of(other)[0]
+        other.close()
+        raise ConfigError(f"topic {topic!r} of node {node!r} is exported already, by process {pid}")
+    one = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    keep_from_children(one)
+    # Bound under another name, so that nobody finds it before it listens, and takes it for one of the dead.
+    beside = path.with_suffix(f".{os.getpid()}")
+    try:
+        with suppress(FileNotFoundError):
+            beside.unlink()
+        with _address(beside) as address:
+            one.bind(address)
+        one.listen(64)
+        one.setblocking(False)
+        beside.rename(path)
+    except BaseException:
+        one.close()
+        raise
+    return one
+
+
+def unlisten(node: str, topic: str) -> None:
+    """Removes the socket's file."""
+    with suppress(FileNotFoundError):
+        _path(node, topic, "socket").unlink()
+
+
+def peer_of(connection: socket.socket) -> tuple[int, int]:
+    """Process and user at the other end, as the kernel says."""
+    raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, user, _ = _CREDENTIALS.unpack(raw)
+    return pid, user
+
+
+def exported_topics(node: str) -> list[str]:
+    """The topics that a live process exports, sorted."""
+    found = []
+    for path in _links(node).glob("*.socket"):
+        one = _connected(path)
+        if one is not None:
+            one.close()
+            found.append(unquote(path.stem))
+    return sorted(found)
+
+
+def reap(node: str) -> list[str]:
+    """Removes what dead processes of a node left behind, and names what it removed.
+
+    Sockets whose process is gone; and once no process of the node exports anything any more, the orders of its topics.
+    Memory needs no reaping: it has no name, and goes with the last process that maps it.
+    """
+    removed: list[Path] = []
+    alive = False
+    folder = _links(node)
+    for path in sorted(folder.iterdir()):
+        if path.suffix == ".order":
+            continue
+        one = _connected(path)
+        if one is not None:
+            one.close()
+            alive = True
+        elif path.suffix == ".socket" or not Path(f"/proc/{path.suffix[1:]}").exists():
+            removed.append(path)
+    if not alive:
+        removed += sorted(folder.glob("*.order"))
+    for path in removed:
+        path.unlink(missing_ok=True)
+    return [os.fspath(path) for path in removed]
+
+
+class OrderFile:
+    """What a topic's order had reached, in a file that the kernel keeps when the process that writes it is killed.
+
+    A producer that comes back goes on in the same epoch where its versions go on, so that what it commits still fits
+    the data of others; where they begin anew, and would be out of order, a new epoch begins.
+    """
+
+    def __init__(self, node: str, topic: str) -> None:
+        """Reads what the life before has left."""
+        path = _path(node, topic, "order")
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        try:
+            if os.fstat(fd).st_size != _ORDER.size:
+                os.ftruncate(fd, 0)
+                os.ftruncate(fd, _ORDER.size)
+            self._map = mmap.mmap(fd, _ORDER.size)
+        finally:
+            os.close(fd)
+        magic, epoch, version = _ORDER.unpack_from(self._map)
+        self._before: tuple[int, int] | None = (epoch, version) if magic == _MAGIC else None
+        self._offset: int | None = None
+        self._reached = (-1, -1)
+
+    def epoch(self, epoch: int, version: int) -> int:
+        """The epoch under which others see an epoch of this process's window, and notes the version there."""
+        if self._offset is None:
+            self._offset = self._decide(epoch, version)
+        order = (epoch + self._offset, version)
+        if order > self._reached:
+            self._reached = order
+            _ORDER.pack_into(self._map, 0, _MAGIC, *order)
+        return order[0]
+
+    def _decide(self, epoch: int, version: int) -> int:
+        if self._before is None or (epoch, version) > self._before:
+            return 0
+        before, newest = self._before
+        return before - epoch if version > newest else before + 1 - epoch
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._map.close()

@@ -1,0 +1,132 @@
+"""What writer and reader say to each other, as messages of a Unix socket that keeps their boundaries.
+
+    reader → writer   once: a hello (codec), then 8 bytes for each slab that it lets go of: its offset
+    writer → reader   once: a welcome (codec) with the descriptor of the memory, then events
+
+An event is its head, for each slab offset and size, and its body: the payload as the codec makes it, arrays in slabs by
+reference. A body that is too long for a message lies in the last of the slabs, from its beginning.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from ..messages import decode, encode
+
+__all__ = ["COMMIT", "INLINE", "MESSAGE", "RELEASE", "SETTLE", "Event", "pack_event", "pack_greeting", "read_greeting"]
+
+INLINE = 4096
+"""The longest body in a message [B]."""
+MESSAGE = 1 << 15
+"""The longest message that is received [B]."""
+RELEASE = struct.Struct("<Q")
+COMMIT, SETTLE = 1, 2
+_TRIGGERS, _NEWEST, _IN_SLAB = 1, 2, 4
+_HEAD = struct.Struct("<BBHIQQQqq")
+_SLAB = struct.Struct("<QQ")
+_PROTOCOL = 1
+_MOST_SLABS = 256
+
+
+class Event(NamedTuple):
+    """A commit, or a settled version, on its way."""
+
+    kind: int
+    number: int
+    """Of the event on this connection, so that what was dropped is noticed."""
+    epoch: int
+    version: int
+    received_ns: int
+    committed_ns: int
+    triggers: bool = False
+    newest: bool = False
+    """Whether it was the newest of the window when it was committed."""
+    slabs: tuple[tuple[int, int], ...] = ()
+    """Offset and size of each [B]."""
+    body: bytes | memoryview = b""
+    """The payload; empty where it lies in the last slab."""
+    body_size: int = 0
+    """Of the payload there."""
+
+
+def pack_event(event: Event) -> bytes:
+    """An event as bytes."""
+    flags = _TRIGGERS * event.triggers | _NEWEST * event.newest | _IN_SLAB * (event.body_size > 0)
+    head = _HEAD.pack(
+        event.kind,
+        flags,
+        len(event.slabs),
+        event.body_size,
+        event.number,
+        event.epoch,
+        event.version,
+        event.received_ns,
+        event.committed_ns,
+    )
+    return b"".join((head, *(_SLAB.pack(*slab) for slab in event.slabs), event.body))
+
+
+def read_event(data: bytes, memory: int) -> Event:
+    """The event in a message.
+
+    Args:
+        data: The message.
+        memory: Size of the writer's memory [B].
+
+    Raises:
+        ValueError: It is truncated, damaged, or speaks of slabs outside the memory.
+    """
+    if len(data) < _HEAD.size:
+        raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD.size}")
+    kind, flags, count, body_size, number, epoch, version, received, committed = _HEAD.unpack_from(data)
+    if kind not in (COMMIT, SETTLE) or flags >= 8 or count > _MOST_SLABS:
+        raise ValueError(f"no event: kind {kind}, flags {flags}, {count} slabs")
+    end = _HEAD.size + count * _SLAB.size
+    if len(data) < end:
+        raise ValueError(f"truncated: {count} slabs expected in {len(data) - _HEAD.size} bytes")
+    slabs = tuple(_SLAB.iter_unpack(memoryview(data)[_HEAD.size : end]))
+    for offset, size in slabs:
+        if size == 0 or offset + size > memory:
+            raise ValueError(f"a slab at {offset} of {size} bytes in a memory of {memory}")
+    if flags & _IN_SLAB and (not slabs or not 0 < body_size <= slabs[-1][1]):
+        raise ValueError(f"a payload of {body_size} bytes in {slabs[-1][1] if slabs else 0} bytes of a slab")
+    return Event(
+        kind,
+        number,
+        epoch,
+        version,
+        received,
+        committed,
+        bool(flags & _TRIGGERS),
+        bool(flags & _NEWEST),
+        slabs,
+        memoryview(data)[end:],
+        body_size if flags & _IN_SLAB else 0,
+    )
+
+
+def pack_greeting(content: Mapping[str, Any]) -> bytes:
+    """A hello or a welcome as bytes."""
+    return encode({"warploom": _PROTOCOL, **content})
+
+
+def read_greeting(data: bytes, wanted: Sequence[tuple[str, type]]) -> dict[str, Any]:
+    """A hello or a welcome.
+
+    Args:
+        data: The message.
+        wanted: The keys that it must have, and the types of their values.
+
+    Raises:
+        ValueError: It is damaged, of another protocol, or lacks something.
+    """
+    content = decode(data)
+    if not isinstance(content, dict) or content.get("warploom") != _PROTOCOL:
+        spoken = content.get("warploom") if isinstance(content, dict) else None
+        raise ValueError(f"the other end speaks protocol {spoken!r}, this one {_PROTOCOL}: run one version of warploom")
+    for key, kind in wanted:
+        if type(content.get(key)) is not kind:
+            raise ValueError(f"{key} of the other end is {content.get(key)!r}, expected {kind.__name__}")
+    return content
