@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,6 +27,7 @@ __all__ = [
     "ThreadsSpec",
     "execution_context",
     "load_profile",
+    "may_have_gpu",
     "profile_device",
     "use_threads",
 ]
@@ -196,9 +198,12 @@ def profile_device(profile: Profile, device: str | None = None) -> str:
     Raises:
         DeviceError: There is no such device; the message says which profile asks for it, and the way out.
     """
+    wanted = device or profile.device
+    # Warp takes seconds to load: where only the CPU can be meant it is not asked.
+    if wanted == "cpu" or (wanted == AUTO and not may_have_gpu()):
+        return "cpu"
     from ..kernels.device import device_names, resolve_device
 
-    wanted = device or profile.device
     if wanted == AUTO:
         return next((name for name in device_names() if name.startswith("cuda")), "cpu")
     try:
@@ -207,6 +212,14 @@ def profile_device(profile: Profile, device: str | None = None) -> str:
         if device is not None:
             raise
         raise DeviceError(f"profile {profile.profile!r}: {error}") from error
+
+
+def may_have_gpu() -> bool:
+    """Whether there may be an NVIDIA GPU here; only Linux says that there is none."""
+    if sys.platform != "linux":
+        return True
+    patterns = ("nvidia[0-9]*", "nvhost-gpu", "nvgpu", "dxg")  # a driver's devices; Jetson's; Windows' below Linux
+    return any(next(Path("/dev").glob(pattern), None) is not None for pattern in patterns)
 
 
 def use_threads(profile: Profile) -> None:
