@@ -1,0 +1,265 @@
+"""Preflight: is what a launch asks for there? Device, memory, models, ports and sensors, each with the way out.
+
+Importing this registers the checks with the launcher.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import parse_qs
+
+from ..dag import ComponentSpec, ConfigFile, nearest
+from ..dag.launch.plan import LaunchPlan
+from ..dag.launch.preflight import Finding, register_check
+from ..errors import ConfigError, DeviceError, ModelError, SourceError
+from .machine import memory_limit_bytes
+from .profile import Profile, profile_device
+
+__all__ = ["check_backends", "check_device", "check_memory", "check_models", "check_ports", "check_sensors"]
+
+_GIB = 2**30
+
+
+def _profile_of(plan: LaunchPlan) -> ConfigFile[Profile] | None:
+    file = plan.profile
+    return file if file is not None and isinstance(file.content, Profile) else None
+
+
+def _device(profile: Profile) -> str | None:
+    """The device of a profile; None where it is not there, which `check_device` says."""
+    try:
+        return profile_device(profile)
+    except DeviceError:
+        return None
+
+
+def check_device(plan: LaunchPlan) -> Iterator[Finding]:
+    """Is the compute device there?"""
+    file = _profile_of(plan)
+    if file is None:
+        return
+    profile = file.content
+    try:
+        device = profile_device(profile)
+    except DeviceError as error:
+        yield Finding(
+            "device", False, str(error),
+            "look with `warploom info` which devices there are; take a profile for one of them "
+            "(--profile cpu), or --set profile.device=cpu",
+        )  # fmt: skip
+        return
+    said = f"{device} for profile {profile.profile!r}"
+    if profile.device == "auto" and device == "cpu":
+        said += ": no CUDA device is here, so the kernels run on the CPU"
+    yield Finding("device", True, said)
+    if device != "cpu":
+        yield _inference_provider(device, profile)
+
+
+def _inference_provider(device: str, profile: Profile) -> Finding:
+    """A head on a GPU wants ONNX Runtime's provider; without it the network runs on the CPU, which is no failure."""
+    import onnxruntime
+
+    providers = onnxruntime.get_available_providers()
+    if "CUDAExecutionProvider" not in providers:
+        return Finding(
+            "device", True,
+            f"ONNX Runtime has no CUDA provider: networks run on the CPU beside {device}; pip install onnxruntime-gpu",
+        )  # fmt: skip
+    if profile.precision == "fp16" and "TensorrtExecutionProvider" not in providers:
+        return Finding("device", True, "ONNX Runtime has no TensorRT provider, so networks compute in tf32, not fp16")
+    return Finding("device", True, f"networks run on {device} in {profile.precision}")
+
+
+def check_backends(plan: LaunchPlan) -> Iterator[Finding]:
+    """Do the libraries compute that the profile names for some kernels?"""
+    file = _profile_of(plan)
+    if file is None:
+        return
+    from ..kernels.backend import uses_taichi
+
+    for kernel, backend in file.content.backends.items():
+        if backend == "warp":
+            continue
+        try:
+            uses_taichi(backend)
+        except (DeviceError, ImportError, ValueError) as error:
+            yield Finding("backend", False, f"{kernel}: {error}", f"--set profile.backends.{kernel}=warp")
+        else:
+            yield Finding("backend", True, f"{kernel} by {backend}")
+
+
+def check_memory(plan: LaunchPlan) -> Iterator[Finding]:
+    """Is there as much memory as the profile asks for, on the GPU or else on the host, within this process's limits?"""
+    file = _profile_of(plan)
+    if file is None or file.content.memory_gib is None:
+        return
+    profile = file.content
+    wanted = profile.memory_gib or 0.0
+    device = _device(profile)
+    if device is None:
+        return
+    if device == "cpu":
+        found, where = memory_limit_bytes(), "this machine, or the limit of its control group, has"
+    else:
+        import warp as wp
+
+        found, where = wp.get_device(device).total_memory, f"{device} has"
+    if found is None:
+        yield Finding("memory", True, "this system does not tell how much memory there is")
+        return
+    # Machines are sold by what they hold; a few per cent of it belong to firmware and driver.
+    enough = found >= 0.9 * wanted * _GIB
+    yield Finding(
+        "memory", enough, f"{where} {found / _GIB:.1f} GiB; profile {profile.profile!r} asks for {wanted:g}",
+        "" if enough else "take a smaller profile (--profile cpu-min), or less capacity with --set "
+        f"profile.memory_gib={math.floor(10 * found / _GIB) / 10:g} --set profile.capacity=…",
+    )  # fmt: skip
+
+
+def check_models(plan: LaunchPlan) -> Iterator[Finding]:
+    """Are the models there, and are they those that their cards mean (sha256)?"""
+    file = _profile_of(plan)
+    if file is None:
+        return
+    from ..models.card import DEFAULT_CARD, load_card
+
+    named = file.content.models.detector
+    card = DEFAULT_CARD if named is None else file.path.parent / named
+    try:
+        loaded, model = load_card(card)
+    except ModelError as error:
+        way_out = (
+            "reinstall warploom: its own model is damaged" if named is None
+            else "fetch model and card again, or leave models.detector out of the profile for the one that ships"
+        )  # fmt: skip
+        yield Finding("models", False, str(error), way_out)
+        return
+    yield Finding("models", True, f"{loaded.name}: {model.name} has the sha256 of its card")
+
+
+def check_ports(plan: LaunchPlan) -> Iterator[Finding]:
+    """Can the ports be had that components are to answer on?"""
+    asked: dict[int, str] = {}
+    for process, component in _components(plan):
+        port = component.config.get("port")
+        if not isinstance(port, int) or isinstance(port, bool) or port == 0:
+            continue
+        who = f"{process}/{component.name}"
+        way_out = f"--set {component.name}.port=0 takes a free one, null none"
+        if port in asked:
+            yield Finding("ports", False, f"{who}: {asked[port]} is to answer on port {port} already", way_out)
+            continue
+        asked[port] = who
+        why = _cannot_listen(port)
+        yield Finding("ports", why is None, f"{who}: port {port} is {why or 'free'}", way_out if why else "")
+
+
+def _cannot_listen(port: int) -> str | None:
+    with socket.socket() as probe:
+        if os.name == "posix":
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except PermissionError:
+            return "not permitted to this user (below 1024 it needs CAP_NET_BIND_SERVICE)"
+        except OSError as error:
+            return f"taken: {error.strerror or error}"
+        except OverflowError:
+            return "no port: they go to 65535"
+    return None
+
+
+def check_sensors(plan: LaunchPlan) -> Iterator[Finding]:
+    """Can what plays each sensor be opened, and are the calibration files there?"""
+    file = _profile_of(plan)
+    sensors = {} if file is None else {one.name: one for specs in file.content.sensors.values() for one in specs}
+    for name, sensor in sensors.items():
+        if sensor.calibration is not None and file is not None:
+            path = file.path.parent / sensor.calibration
+            if not path.is_file():
+                yield Finding(
+                    "sensors", False, f"{name}: its calibration {path} is not there",
+                    f"put the file there, or take calibration out of {file.path} for what the sensor's type gives",
+                )  # fmt: skip
+    for process, component in _components(plan):
+        if "sensor" not in component.config:
+            continue
+        driver = _driver_of(component)
+        if driver is None:
+            continue
+        who = f"{process}/{component.name}"
+        name = component.config["sensor"]
+        uri = _source_of(driver, component, sensors.get(name), file)
+        if uri is None:
+            continue
+        why = _cannot_open(uri)
+        way_out = f"connect it, or name another source for sensor {name!r} in the profile, such as sim:street"
+        yield Finding("sensors", why is None, f"{who}: {uri}{f': {why}' if why else ''}", way_out if why else "")
+
+
+def _driver_of(component: ComponentSpec) -> Any:
+    """The class of a component that drives a sensor; None where it is none."""
+    from ..dag import import_class
+    from .node.lidar import LidarDriver
+
+    try:
+        found = import_class(component.class_name) if component.class_name else None
+    except ConfigError:  # building the process says it
+        return None
+    return found if found is not None and issubclass(found, LidarDriver) else None
+
+
+def _source_of(driver: Any, component: ComponentSpec, sensor: Any, file: ConfigFile[Profile] | None) -> str | None:
+    from .execution import ExecutionContext
+
+    try:
+        made = driver(component.name, ExecutionContext(sensors={} if sensor is None else {sensor.name: sensor}))
+        made.init(driver.Config.model_validate(component.config))
+    except ValueError:  # building the process says it
+        return None
+    return made.source
+
+
+def _cannot_open(uri: str) -> str | None:
+    """Why a source cannot be opened; of the simulator only its words are looked at, its world is not built."""
+    from .sources import open_source
+
+    try:
+        if uri.startswith("sim:"):
+            _check_simulator(uri)
+        else:
+            open_source(uri)
+    except (ConfigError, SourceError, ValueError) as error:
+        return str(error)
+    return None
+
+
+def _check_simulator(uri: str) -> None:
+    from ..models.simulator import SCENARIOS
+    from ..models.simulator.sensors import lidar_model
+
+    scenario, _, query = uri.removeprefix("sim:").partition("?")
+    if scenario not in SCENARIOS:
+        raise ValueError(f"no scenario {scenario!r}; {nearest(scenario, SCENARIOS)}")
+    for model in parse_qs(query).get("lidar", ()):
+        lidar_model(model)
+
+
+def _components(plan: LaunchPlan) -> Iterator[tuple[str, ComponentSpec]]:
+    for process, files in plan.modules.items():
+        for file in files:
+            for component in file.content.components:
+                yield process, component
+
+
+register_check("device", check_device)
+register_check("backend", check_backends)
+register_check("memory", check_memory)
+register_check("models", check_models)
+register_check("ports", check_ports)
+register_check("sensors", check_sensors)

@@ -1,0 +1,180 @@
+"""Single random scenes, each unlike the next: for training and tests; alone, or several in one launch."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...kernels.device import resolve_device
+from ...kernels.raycast import LidarCast
+from .ego import mounting
+from .frame import SimulatedFrame
+from .furnishing import furnish, populate
+from .library import Library
+from .sensors import LIDARS, Lidar, lidar_model
+from .street import STYLES, Street, random_street
+from .sweep import START_NS, caster, observe, read_frame, set_scene
+from .world import World, place
+
+__all__ = ["SceneBatch", "sample_scene"]
+
+_PERIOD = 0.1  # [s]
+_DRAWN = ("vlp16", "hdl32", "vlp32", "xt32", "pandar40", "hdl64", "pandar64", "pandar90", "vls128", "os1_128")
+_workshop = threading.local()
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What a seed draws: a street, and where the ego vehicle stands or drives on it."""
+
+    street: Street
+    pose_at: Callable[[float], np.ndarray]
+
+
+def _drawn_lidar(random: np.random.Generator) -> Lidar:
+    weights = np.array([6.0 if LIDARS[name].lines == 64 else 1.0 for name in _DRAWN])
+    return LIDARS[_DRAWN[random.choice(len(_DRAWN), p=weights / weights.sum())]]
+
+
+def _draw(random: np.random.Generator, mounting_height: float | None, turning: bool) -> _Scene:
+    style = STYLES[random.choice(len(STYLES), p=[0.35, 0.3, 0.2, 0.15])]
+    share = random.uniform(0.25, 0.95)
+    street, plan = random_street(random, style=style, extent=(-75.0, 75.0), crossings=int(random.integers(0, 3)))
+    s, d = random.uniform(-12, 12), random.choice([-1, 1]) * random.uniform(0.8, max(1.0, plan.half_width - 1.2))
+    street.block(s, d, 2.4)
+    populate(street, plan, walkers=0, riders=int(random.integers(0, 7)), cars=int(random.integers(1, 11)),
+             works=int(random.integers(0, 3)))  # fmt: skip
+    # Cars at any angle: turning, pulling out, double parked.
+    for _ in range(random.integers(2, 9)):
+        street.add(
+            street.car_kind(heavy=0.12), random.uniform(-55, 55), random.normal(0, 10), random.uniform(0, 2 * np.pi)
+        )
+    furnish(street, plan, share)
+    populate(street, plan, walkers=int(random.integers(3, 30)), riders=int(random.integers(0, 4)), cars=0, works=0)
+    for _ in range(random.integers(0, 8)):
+        kind = ("pedestrian", "cyclist", "cone", "barrier", "stander")[random.integers(5)]
+        street.add(kind, random.uniform(-40, 40), random.normal(0, 8), random.uniform(0, 2 * np.pi))
+    heading = (
+        random.choice([0.0, np.pi]) + random.normal(0, 0.15) if random.random() < 0.75 else random.uniform(0, 2 * np.pi)
+    )
+    height = random.uniform(1.6, 2.1) if random.random() < 0.8 else random.uniform(1.2, 2.6)
+    mount = mounting(mounting_height or height, random.normal(0, 0.012), random.normal(0, 0.01))
+    speed = random.uniform(0.0, 14.0) if turning and random.random() < 0.8 else 0.0
+
+    def pose_at(t: float) -> np.ndarray:
+        one = np.ones(1)
+        gone = speed * t
+        at_s, at_d = s + gone * np.cos(heading), d + gone * np.sin(heading)
+        upright = np.zeros(1, bool)
+        return place(street.ground, at_s * one, at_d * one, heading * one, 0 * one, np.ones((1, 3)), upright)[0] @ mount
+
+    return _Scene(street, pose_at)
+
+
+def sample_scene(
+    seed: int,
+    lidar: str | Lidar | None = None,
+    *,
+    mounting_height: float | None = None,
+    turning: bool = False,
+    rain: float = 0.0,
+    visibility: bool = False,
+    device: str = "cpu",
+) -> SimulatedFrame:
+    """One sweep of one random scene, unlike the next: for training and tests.
+
+    Street, traffic, clutter, the ego's place and heading, the sensor's height and tilt, all are drawn from the seed.
+
+    Args:
+        seed: Any integer ≥ 0.
+        lidar: A sensor or its name; None draws one, most often one of 64 lines.
+        mounting_height: Of the sensor above the ground [m]; None draws it.
+        turning: Whether the sweep takes 0.1 s, in which the ego vehicle drives too; else it is taken in an instant.
+        rain: How hard it rains [mm/h].
+        visibility: Whether to tell how much of each object can be seen.
+        device: Where rays are cast.
+
+    Raises:
+        ValueError: No such sensor.
+        DeviceError: No such device.
+    """
+    random = np.random.default_rng([seed, 11])
+    drawn = _drawn_lidar(random)
+    model = lidar if isinstance(lidar, Lidar) else lidar_model(lidar) if lidar else drawn
+    device = resolve_device(device)
+    kept = _workshop.__dict__.setdefault("kept", {})
+    if device not in kept:
+        kept[device] = (Library(device), {})
+    library, casts = kept[device]
+    wetness = 1.0 if rain > 0 else 0.0
+    key = (id(model), wetness)
+    if key not in casts:
+        casts[key] = (caster(library, model, _PERIOD, wetness=wetness), model)
+    cast: LidarCast = casts[key][0]
+    cast.set_rain(rain)
+    scene = _draw(random, mounting_height, turning)
+    return observe(
+        World(scene.street, library), cast, model, scene.pose_at, 0.0, turn=_PERIOD if turning else 0.0, seed=seed,
+        index=0, version=START_NS, visibility=visibility,
+    )  # fmt: skip
+
+
+class SceneBatch:
+    """Several random scenes cast in one launch: the same frames as `sample_scene` gives one by one.
+
+    On a GPU all beams of all scenes are threads of one launch; a CPU takes the scenes in turn.
+    """
+
+    def __init__(self, worlds: int, lidar: str | Lidar = "hdl64", *, turning: bool = False, device: str = "cpu"):
+        """Takes the memory for a batch.
+
+        Args:
+            worlds: Scenes in a batch.
+            lidar: The sensor of all of them, or its name.
+            turning: As in `sample_scene`.
+            device: Where rays are cast.
+
+        Raises:
+            ValueError: Fewer than one world, or no such sensor.
+            DeviceError: No such device.
+        """
+        self.lidar = lidar_model(lidar) if isinstance(lidar, str) else lidar
+        self.turning = turning
+        self._library = Library(resolve_device(device), grounds=worlds)
+        self._cast = caster(self._library, self.lidar, _PERIOD, worlds=worlds)
+
+    def frames(self, seeds: Sequence[int], *, visibility: bool = False) -> list[SimulatedFrame]:
+        """The scenes of these seeds.
+
+        Args:
+            seeds: One for each world, or fewer.
+            visibility: Whether to tell how much of each object can be seen.
+
+        Raises:
+            ValueError: More seeds than worlds, or none.
+        """
+        if not 0 < len(seeds) <= self._cast.worlds:
+            raise ValueError(f"seeds must be 1 to {self._cast.worlds}, not {len(seeds)}")
+        turn = _PERIOD if self.turning else 0.0
+        scenes: list[tuple[World, Callable[[float], np.ndarray]]] = []
+        for number in range(self._cast.worlds):
+            seed = int(seeds[min(number, len(seeds) - 1)])
+            if number < len(seeds):
+                random = np.random.default_rng([seed, 11])
+                _drawn_lidar(random)  # so that the draws are those of `sample_scene`
+                scene = _draw(random, None, self.turning)
+                scenes.append((World(scene.street, self._library, ground=number), scene.pose_at))
+            # Worlds without a seed of their own repeat the last one: every beam needs a scene.
+            world, pose_at = scenes[-1]
+            set_scene(world, self._cast, pose_at, 0.0, turn=turn, seed=seed, number=number)
+        self._cast.launch()
+        return [
+            read_frame(
+                world, self._cast, self.lidar, pose_at, 0.0, turn=turn, index=0, version=START_NS,
+                visibility=visibility, number=number,
+            )
+            for number, (world, pose_at) in enumerate(scenes)
+        ]  # fmt: skip
