@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections import deque
+from collections.abc import Callable
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -47,7 +48,10 @@ class Backlog:
         self._depth = 1 if config.policy == "latest" else config.depth
         self._drop_newest = config.policy == "fifo" and config.drop == "newest"
         self._losses = losses
-        self._waiting: deque[Trigger] = deque()
+        self.waiting: deque[Trigger] = deque()
+        """What waits, the oldest first: to be looked at."""
+        self.on_taken: Callable[[Trigger], None] | None = None
+        """Is told of each frame that is taken, in the thread that takes it."""
         self._frames = 0  # of those that wait, the ones that are not settled
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
@@ -57,7 +61,7 @@ class Backlog:
         self._closed = False
 
     def __len__(self) -> int:
-        return len(self._waiting)
+        return len(self.waiting)
 
     def offer(self, trigger: Trigger) -> Trigger | None:
         """Adds a trigger; with policy `block` waits for room.
@@ -67,40 +71,59 @@ class Backlog:
             offers settles its version. A settled one is only given back where very many wait, and is not counted.
         """
         dropped: Trigger | None = None
+        reason = "backlog"
         with self._lock:
-            while self._blocks and not trigger.settled and self._frames >= self._depth and not self._closed:
-                self._room.wait()
-            reason = "shutdown" if self._closed else "backlog"
-            if self._closed:
-                dropped = trigger
-            elif trigger.settled:
-                if len(self._waiting) - self._frames >= _SETTLED:
-                    dropped = self._take_first(settled=True)
-            elif self._frames >= self._depth:
-                dropped = trigger if self._drop_newest else self._take_first(settled=False)
+            if trigger.settled or self._frames >= self._depth or self._closed:
+                dropped, reason = self._make_room(trigger)
+            wakes = False
             if dropped is not trigger:
-                self._waiting.append(trigger)
+                self.waiting.append(trigger)
                 self._frames += not trigger.settled
-            wakes = self._sleepers > 0 and dropped is not trigger
-            self._sleepers -= wakes
+                wakes = self._sleepers > 0
+                self._sleepers -= wakes
         if wakes:
             self._wakes.put(None)
         if dropped is not None and not dropped.settled:
             self._losses.count(self._place, reason, dropped.version)
         return dropped
 
+    def _make_room(self, trigger: Trigger) -> tuple[Trigger | None, str]:
+        """Makes room, or waits for it: what is dropped, and why. Called with the lock held."""
+        while self._blocks and not trigger.settled and self._frames >= self._depth and not self._closed:
+            self._room.wait()
+        if self._closed:
+            return trigger, "shutdown"
+        if trigger.settled:
+            full = len(self.waiting) - self._frames >= _SETTLED
+            return (self._take_first(settled=True) if full else None), "backlog"
+        if self._frames >= self._depth:
+            return (trigger if self._drop_newest else self._take_first(settled=False)), "backlog"
+        return None, "backlog"
+
     def _take_first(self, *, settled: bool) -> Trigger:
-        dropped = next(waiting for waiting in self._waiting if waiting.settled is settled)
-        self._waiting.remove(dropped)
+        dropped = next(waiting for waiting in self.waiting if waiting.settled is settled)
+        self.waiting.remove(dropped)
         self._frames -= not settled
         return dropped
+
+    def rouse(self) -> None:
+        """Wakes a thread that waits in `take`, ahead of a trigger: a wake takes longer than a commit."""
+        if self._sleepers:
+            with self._lock:
+                wakes = self._sleepers > 0
+                self._sleepers -= wakes
+            if wakes:
+                self._wakes.put(None)
 
     def take(self) -> Trigger | None:
         """The oldest trigger, waited for; None once the backlog is closed and empty."""
         while True:
+            trigger = self.take_now()
+            if trigger is not None:
+                return trigger
             with self._lock:
-                if self._waiting:
-                    return self._pop()
+                if self.waiting:
+                    continue
                 if self._closed:
                     return None
                 self._sleepers += 1
@@ -109,14 +132,16 @@ class Backlog:
     def take_now(self) -> Trigger | None:
         """The oldest trigger; None when there is none."""
         with self._lock:
-            return self._pop() if self._waiting else None
-
-    def _pop(self) -> Trigger:
-        trigger = self._waiting.popleft()
-        if not trigger.settled:
+            if not self.waiting:
+                return None
+            trigger = self.waiting.popleft()
+            if trigger.settled:
+                return trigger
             self._frames -= 1
             if self._blocks:
                 self._room.notify()
+        if self.on_taken is not None:
+            self.on_taken(trigger)
         return trigger
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Container, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel
@@ -126,8 +127,7 @@ class DataProcessComponent(Component):
         self.trigger_inputs: tuple[str, ...] = ()
         self.backlog: Backlog | None = None
         """The triggers that wait; None before `set_trigger`."""
-        self._source = TriggerSource()
-        self._wanted: Container[tuple[int, int]] | None = None
+        self._source = TriggerSource(self._offer)
         self._windows: dict[str, Window[Any]] = {}
         self._inline = self._runs_later = False
         self._thread: threading.Thread | None = None
@@ -201,31 +201,30 @@ class DataProcessComponent(Component):
         Args:
             wanted: Epochs and versions that will be given; the other versions of the mesh are settled.
         """
-        self._wanted = wanted
         # It blocks, also where ticks of time would replace each other: nothing of what is given may be lost.
         self.backlog = Backlog(self.name, BacklogConfig(policy="block"), self.losses)
+        self._source.offer = partial(self._offer_unwanted, wanted)
         if not self.trigger_inputs:
-            self._source = TriggerSource()
+            self._source = TriggerSource(self._offer)
+
+    def _offer_unwanted(self, wanted: Container[tuple[int, int]], trigger: Trigger) -> None:
+        if trigger.settled:
+            self._offer(trigger)
+        elif (trigger.epoch, trigger.version) not in wanted:
+            self.settle(trigger.version, trigger.epoch)
 
     def give(self, trigger: Trigger) -> None:
         """Gives a trigger to a component that follows a replay; waits until there is room for it."""
-        self._enqueue(trigger)
+        self._offer(trigger)
         self._advance()
 
     def _offer(self, trigger: Trigger) -> None:
-        """Takes a trigger of the mesh or of time."""
-        if self._wanted is not None and not trigger.settled:
-            if (trigger.epoch, trigger.version) not in self._wanted:
-                self.settle(trigger.version, trigger.epoch)
-        elif self._enqueue(trigger) and not self._runs_later:
-            self._advance()
-
-    def _enqueue(self, trigger: Trigger) -> bool:
         assert self.backlog is not None
         dropped = self.backlog.offer(trigger)
         if dropped is not None:
             self.settle(dropped.version, dropped.epoch)
-        return dropped is not trigger
+        if not self._runs_later and dropped is not trigger:
+            self._advance()
 
     def _rouse(self) -> None:
         """Wakes the thread that a trigger is about to need."""

@@ -12,14 +12,14 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from ..datamesh import Status
 from .deadline import FrameDeadline
-from .processor import Processor
+from .processor import Processor, Read, Wiring
 from .trigger import Trigger
 
 __all__ = ["GraphEngine", "Run", "Vertex", "VertexTiming"]
@@ -41,8 +41,8 @@ class VertexTiming(NamedTuple):
     late: bool = False
     """Whether it ended later after `ready_ns` than its deadline allows."""
     epoch: int = 0
-    reads: Mapping[str, tuple[int, int]] = MappingProxyType({})
-    """Epoch and version of what it read of inputs that did not trigger it, by input."""
+    reads: Mapping[str, Read] = MappingProxyType({})
+    """What it read of inputs that did not trigger it, by input."""
 
     @property
     def wait_ms(self) -> float:
@@ -71,6 +71,11 @@ class Vertex:
     """From when its inputs are there to its end; what takes longer is counted [ns]."""
     expendable: bool = False
     """Whether it is left out in a frame past its deadline, where the component degrades such frames."""
+    left_out: Container[tuple[int, int]] = ()
+    """Epochs and versions of the frames in which it is left out in any case: a replay says them."""
+    number: int = 0
+    """Its place in the graph."""
+    wiring: Wiring | None = None
     successors: list[Vertex] = field(default_factory=list)
     predecessors: int = 0
     queue: deque[Run] = field(default_factory=deque)
@@ -85,9 +90,9 @@ class Run:
     trigger: Trigger
     data: dict[str, Any]
     on_done: Callable[[Run], None]
-    waiting: dict[Vertex, int]
-    """Predecessors that have yet to finish, by vertex."""
-    ready_ns: dict[Vertex, int]
+    waiting: list[int]
+    """Predecessors that have yet to finish, by the vertex's number."""
+    ready_ns: list[int]
     """When the inputs of each vertex were there."""
     remaining: int
     """Vertices that have yet to finish."""
@@ -131,12 +136,14 @@ class GraphEngine:
         self._stopping = False
         self._threads: list[threading.Thread] = []
         producers = {datum: vertex for vertex in vertices for datum in vertex.outputs.values()}
-        for vertex in vertices:
+        for number, vertex in enumerate(vertices):
+            vertex.number = number
+            vertex.wiring = Wiring(vertex.processor, vertex.inputs, vertex.outputs)
             sources = {id(producers[d]): producers[d] for d in vertex.inputs.values() if d in producers}
             vertex.predecessors = len(sources)
             for source in sources.values():
                 source.successors.append(vertex)
-        self._predecessors = {vertex: vertex.predecessors for vertex in vertices}
+        self._predecessors = [vertex.predecessors for vertex in vertices]
         self._roots = [vertex for vertex in vertices if vertex.predecessors == 0]
 
     def start(self) -> None:
@@ -205,8 +212,8 @@ class GraphEngine:
             serves: The caller serves the graph next, so one worker fewer is woken.
         """
         vertices = self._vertices
-        ready_ns = dict.fromkeys(self._roots, time.perf_counter_ns())
-        run = Run(trigger, data, on_done, self._predecessors.copy(), ready_ns, len(vertices), deadline=deadline)
+        ready_ns = [time.perf_counter_ns()] * len(vertices)
+        run = Run(trigger, data, on_done, self._predecessors.copy(), ready_ns, len(vertices), None, "", deadline)
         ready = 0
         with self._lock:
             for vertex in vertices:
@@ -219,7 +226,7 @@ class GraphEngine:
 
     def _offer(self, vertex: Vertex) -> int:
         """Makes the vertex's next frame ready to run if both are; gives how many it made. Called with the lock held."""
-        if vertex.running is not None or not vertex.queue or vertex.queue[0].waiting[vertex] > 0:
+        if vertex.running is not None or not vertex.queue or vertex.queue[0].waiting[vertex.number] > 0:
             return 0
         vertex.running = run = vertex.queue.popleft()
         self._ready.append((vertex, run, False))
@@ -230,6 +237,14 @@ class GraphEngine:
         wakes = min(ready, self._sleepers) if ready > 0 else 0
         self._sleepers -= wakes
         return wakes
+
+    def rouse(self) -> None:
+        """Wakes a worker for a frame that is about to be submitted: to wake takes longer than a commit."""
+        if self._sleepers:
+            with self._lock:
+                wakes = self._claim(1)
+            if wakes:
+                self._wakes.put(None)
 
     def _work(self) -> None:
         while True:
@@ -260,9 +275,10 @@ class GraphEngine:
                 done = run.remaining == 0
                 ready = 0
                 for successor in vertex.successors:
-                    run.waiting[successor] -= 1
-                    if run.waiting[successor] == 0:
-                        run.ready_ns[successor] = now
+                    number = successor.number
+                    run.waiting[number] -= 1
+                    if run.waiting[number] == 0:
+                        run.ready_ns[number] = now
                         ready += self._offer(successor)
                 ready += self._offer(vertex)
                 # One is for this thread, without a change of threads, unless it has a frame to hand over first.
@@ -292,11 +308,12 @@ class GraphEngine:
 
     def _execute(self, vertex: Vertex, run: Run, resumed: bool) -> bool:
         """Runs a vertex for a frame; False where it waits, and goes on later."""
-        processor = vertex.processor
+        processor, wiring = vertex.processor, vertex.wiring
+        assert wiring is not None
         start = time.perf_counter_ns()
-        if run.deadline is not None and run.deadline.leaves_out(vertex.expendable):
+        if (run.deadline is not None or vertex.left_out) and _is_left_out(vertex, run):
             status = Status.CUT
-        elif not resumed and not self._fill(vertex, run):
+        elif not resumed and not wiring.fill(run.data):
             status = Status.SKIPPED
         else:
             try:
@@ -307,20 +324,16 @@ class GraphEngine:
                 status = processor.process(run.trigger)
                 if not isinstance(status, Status):
                     raise TypeError(f"process of {type(processor).__name__} returned {status!r}, not a Status")
+                wiring.collect(run.data)
             except BaseException as error:  # also SystemExit: only the process as a whole may end a worker
                 status = Status.FAILED
                 run.error, run.failed_vertex = error, vertex.name
                 _log.exception("%s.%s failed at version %d", self.name, vertex.name, run.trigger.version)
-            else:
-                for name, datum in vertex.outputs.items():
-                    if processor.ports[name].present:
-                        run.data[datum] = processor.ports[name].value
-        for port in processor.ports.values():
-            port.clear()
+        wiring.clear()
         reads = processor.reads
         if reads:
             processor.reads = {}
-        end, ready = time.perf_counter_ns(), run.ready_ns.get(vertex, start)
+        end, ready = time.perf_counter_ns(), run.ready_ns[vertex.number]
         late = vertex.deadline_ns is not None and end - ready > vertex.deadline_ns
         if late:
             processor.losses.count(processor.place, "deadline", run.trigger.version)
@@ -330,17 +343,9 @@ class GraphEngine:
             self._tell(self._on_timing, timing)
         return True
 
-    def _fill(self, vertex: Vertex, run: Run) -> bool:
-        """Gives a vertex its inputs; tells whether all that it needs are there."""
-        processor = vertex.processor
-        runnable = True
-        for name, datum in vertex.inputs.items():
-            port = processor.ports[name]
-            if datum in run.data:
-                port.value = run.data[datum]
-            else:
-                port.clear()
-                runnable = runnable and port.optional
-        for name in vertex.outputs:
-            processor.ports[name].clear()
-        return runnable
+
+def _is_left_out(vertex: Vertex, run: Run) -> bool:
+    trigger = run.trigger
+    if (trigger.epoch, trigger.version) in vertex.left_out:
+        return True
+    return run.deadline is not None and run.deadline.leaves_out(vertex.expendable)

@@ -17,12 +17,14 @@ from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, 
 
 from pydantic import BaseModel, ConfigDict
 
-from ..datamesh import Input, LossCounters, Output, Status
+from ..datamesh import Input, LossCounters, Outcome, Output, Status
 from .trigger import Trigger
 
-__all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "declared_ports"]
+__all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "Read", "Wiring", "declared_ports"]
 
 T = TypeVar("T")
+Read = tuple[int, int] | Outcome
+"""Epoch and version of a datum that was read, or how the wait for it ended without."""
 _ABSENT: Any = object()
 
 
@@ -115,9 +117,9 @@ class Processor:
         self.losses = LossCounters()
         self.flags: Mapping[str, Any] = {}
         """What the flag loaders of the process found."""
-        self.reads: dict[str, tuple[int, int]] = {}
-        """Epoch and version of what this run read of inputs that did not trigger it, by input; the timings tell it."""
-        self.recorded_reads: Callable[[Trigger], Mapping[str, tuple[int, int]]] | None = None
+        self.reads: dict[str, Read] = {}
+        """What this run read of inputs that did not trigger it, by input; the timings tell it."""
+        self.recorded_reads: Callable[[Trigger], Mapping[str, Read]] | None = None
         """In a replay: what the recorded run read. It is waited for, without a deadline, and nothing else is taken."""
         self.component_inputs: Mapping[str, Input] = {}
         self.component_outputs: Mapping[str, Output] = {}
@@ -156,6 +158,44 @@ class Processor:
 
     def close(self) -> None:
         """Lets go of what `init` took."""
+
+
+class Wiring:
+    """How the ports of a processor and the data of a frame are connected."""
+
+    __slots__ = ("_ports", "_reads", "_writes")
+
+    def __init__(self, processor: Processor, inputs: Mapping[str, str], outputs: Mapping[str, str]) -> None:
+        """Connects them.
+
+        Args:
+            processor: Whose ports they are.
+            inputs: In port → name of the datum.
+            outputs: Out port → name of the datum.
+        """
+        self._ports = tuple(processor.ports.values())
+        self._reads = tuple((processor.ports[port], datum) for port, datum in inputs.items())
+        self._writes = tuple((processor.ports[port], datum) for port, datum in outputs.items())
+
+    def fill(self, data: Mapping[str, Any]) -> bool:
+        """Gives the In ports, which are clear, what is there; tells whether all that is needed is."""
+        for port, datum in self._reads:
+            if datum in data:
+                port._value = data[datum]
+            elif not port.optional:
+                return False
+        return True
+
+    def collect(self, data: dict[str, Any]) -> None:
+        """Takes what was written to the Out ports."""
+        for port, datum in self._writes:
+            if port._value is not _ABSENT:
+                data[datum] = port._value
+
+    def clear(self) -> None:
+        """Makes all ports absent."""
+        for port in self._ports:
+            port._value = _ABSENT
 
 
 class ProcessorHarness:

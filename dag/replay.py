@@ -19,7 +19,6 @@ from .component import DataProcessComponent
 from .configuration import nearest
 from .process import Process
 from .run_log import RecordedRuns
-from .triggering import AllTrigger
 
 __all__ = ["Difference", "Replay", "ReplayResult", "produced_topics"]
 
@@ -249,8 +248,7 @@ def _triggered_by(process: Process, topic: str) -> list[str]:
             if not isinstance(component, DataProcessComponent):
                 continue
             # Several inputs that trigger together do so at the versions of the first.
-            together = isinstance(component._source, AllTrigger)
-            names = component.trigger_inputs[:1] if together else component.trigger_inputs
+            names = component.trigger_inputs[:1] if component.triggers_together else component.trigger_inputs
             if at in [component.inputs[name].topic for name in names]:
                 topics = [output.topic for output in component.outputs.values() if output.topic not in reached]
                 reached.update(dict.fromkeys(topics))

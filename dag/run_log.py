@@ -9,68 +9,23 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
-from ..datamesh import Miss, Status
+from ..datamesh import Miss, Outcome, Status
 from ..datamesh.recording import READS, RUNS, RecordedEvent
-from .backlog import Backlog, BacklogConfig
 from .component import DagComponent, DataProcessComponent
 from .engine import VertexTiming
 from .process import Process
-from .processor import Processor
+from .processor import Read
 from .trigger import Trigger
-from .triggering import TriggerSource
 
 __all__ = ["RecordedRuns", "RunLog"]
 
 _Order = tuple[int, int]
 Log = Callable[[str, int, int, object], None]
-
-
-class _Backlog:
-    """A backlog with something before or behind it."""
-
-    def __init__(self, inner: Backlog) -> None:
-        self._inner = inner
-
-    def __len__(self) -> int:
-        return len(self._inner)
-
-    def offer(self, trigger: Trigger) -> Trigger | None:
-        return self._inner.offer(trigger)
-
-    def take(self) -> Trigger | None:
-        return self._inner.take()
-
-    def take_now(self) -> Trigger | None:
-        return self._inner.take_now()
-
-    def open(self) -> None:
-        self._inner.open()
-
-    def close(self) -> None:
-        self._inner.close()
-
-
-class _Logged(_Backlog):
-    """Tells which triggers the component takes."""
-
-    def __init__(self, inner: Backlog, on_taken: Callable[[Trigger], None]) -> None:
-        super().__init__(inner)
-        self._on_taken = on_taken
-
-    def take(self) -> Trigger | None:
-        return self._told(super().take())
-
-    def take_now(self) -> Trigger | None:
-        return self._told(super().take_now())
-
-    def _told(self, trigger: Trigger | None) -> Trigger | None:
-        if trigger is not None and not trigger.settled:
-            self._on_taken(trigger)
-        return trigger
 
 
 class RunLog:
@@ -82,8 +37,8 @@ class RunLog:
     def watch(self, process: Process) -> None:
         """Logs what the components of a process take, which has not started."""
         for component in process.components.values():
-            if isinstance(component, DataProcessComponent) and component._backlog is not None:
-                component._backlog = _Logged(component._backlog, partial(self._on_taken, component.name))  # type: ignore[assignment]
+            if isinstance(component, DataProcessComponent) and component.backlog is not None:
+                component.backlog.on_taken = partial(self._on_taken, component.name)
 
     def _on_taken(self, component: str, trigger: Trigger) -> None:
         self._log(RUNS, trigger.epoch, trigger.version, (component, dict(trigger.inputs)))
@@ -91,8 +46,9 @@ class RunLog:
     def on_timing(self, timing: VertexTiming) -> None:
         """Logs what a vertex read, and that it was left out."""
         if timing.reads or timing.status is Status.CUT:
-            reads = None if timing.status is Status.CUT else {name: tuple(read) for name, read in timing.reads.items()}
-            self._log(READS, timing.epoch, timing.version, (f"{timing.component}.{timing.vertex}", reads))
+            reads = {name: r.value if isinstance(r, Outcome) else tuple(r) for name, r in timing.reads.items()}
+            what = None if timing.status is Status.CUT else reads
+            self._log(READS, timing.epoch, timing.version, (f"{timing.component}.{timing.vertex}", what))
 
 
 @dataclass
@@ -112,7 +68,8 @@ class RecordedRuns:
 
     def __init__(self) -> None:
         self._taken: dict[str, _Taken] = defaultdict(_Taken)
-        self._reads: dict[str, dict[_Order, Mapping[str, _Order] | None]] = defaultdict(dict)
+        self._reads: dict[str, dict[_Order, Mapping[str, Read] | None]] = defaultdict(dict)
+        """Vertex → epoch and version of the frame → what it read, by input; None where it was left out."""
 
     def add(self, event: RecordedEvent, first: int) -> None:
         """Takes up an entry.
@@ -133,7 +90,7 @@ class RecordedRuns:
         elif what is None:
             self._reads[place][order] = None
         else:
-            self._reads[place][order] = {name: (epoch - first, version) for name, (epoch, version) in what.items()}
+            self._reads[place][order] = {name: _read(read, first) for name, read in what.items()}
 
     def __bool__(self) -> bool:
         return bool(self._taken)
@@ -142,24 +99,19 @@ class RecordedRuns:
         """Makes a process that has not started take the triggers of the log, and read what it says."""
         for component in process.components.values():
             taken = self._taken.get(component.name)
-            if not isinstance(component, DataProcessComponent) or taken is None or component._backlog is None:
+            if not isinstance(component, DataProcessComponent) or taken is None or component.backlog is None:
                 continue
-            # It blocks, also where ticks of time would replace each other: nothing of the log may be lost.
-            backlog = Backlog(component.name, BacklogConfig(policy="block"), component.losses)
-            component._backlog = _Replayed(backlog, taken.runs)  # type: ignore[assignment]
-            if not component.trigger_inputs:
-                component._source = TriggerSource()  # no ticks of a clock
+            component.follow({(epoch, version) for epoch, version, _ in taken.runs})
             for name in component.trigger_inputs:
                 give = partial(self._on_event, component)
                 component.inputs[name].window.subscribe(give, give)
         for component in process.components.values():
-            for vertex in component._vertices if isinstance(component, DagComponent) else ():
+            for vertex in component.vertices if isinstance(component, DagComponent) else ():
                 place = f"{component.name}.{vertex.name}"
                 vertex.processor.recorded_reads = partial(self._read, place)
-                if None in self._reads[place].values():
-                    vertex.processor = _LeftOut(vertex.processor, self._reads[place])
+                vertex.left_out = {order for order, read in self._reads[place].items() if read is None}
 
-    def _read(self, place: str, trigger: Trigger) -> Mapping[str, _Order]:
+    def _read(self, place: str, trigger: Trigger) -> Mapping[str, Read]:
         return self._reads[place].get((trigger.epoch, trigger.version)) or {}
 
     def on_played(self, event: RecordedEvent, process: Process) -> None:
@@ -191,9 +143,7 @@ class RecordedRuns:
                     continue
                 now = component.clock.monotonic_ns()
                 trigger = Trigger(version, received or now, False, epoch, now, inputs)
-                assert isinstance(component._backlog, _Replayed)
-                component._backlog.give(trigger)
-                component._advance()
+                component.give(trigger)
 
     @staticmethod
     def _received(component: DataProcessComponent, epoch: int, inputs: Mapping[str, int]) -> int | None:
@@ -209,42 +159,9 @@ class RecordedRuns:
         return received
 
 
-class _Replayed(_Backlog):
-    """Takes the triggers of the log, and none that the mesh makes; those that the run did not take are given back."""
-
-    def __init__(self, inner: Backlog, runs: Iterable[tuple[int, int, Mapping[str, int]]]) -> None:
-        super().__init__(inner)
-        self._wanted = {(epoch, version) for epoch, version, _ in runs}
-
-    def offer(self, trigger: Trigger) -> Trigger | None:
-        if trigger.settled:
-            return super().offer(trigger)
-        return None if (trigger.epoch, trigger.version) in self._wanted else trigger
-
-    def give(self, trigger: Trigger) -> None:
-        """Takes a trigger of the log."""
-        super().offer(trigger)
-
-
-class _LeftOut(Processor):
-    """A vertex that the recorded run left out in some frames."""
-
-    def __init__(self, inner: Processor, reads: Mapping[_Order, object]) -> None:
-        self.__dict__.update(inner.__dict__)
-        self._inner = inner
-        self._left_out = {order for order, read in reads.items() if read is None}
-        self.waits = inner.waits  # type: ignore[misc]
-
-    def init(self, config) -> None:
-        self._inner.init(config)
-
-    def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
-        return (trigger.epoch, trigger.version) not in self._left_out and self._inner.begin(trigger, resume)
-
-    def process(self, trigger: Trigger) -> Status:
-        if (trigger.epoch, trigger.version) in self._left_out:
-            return Status.CUT
-        return self._inner.process(trigger)
-
-    def close(self) -> None:
-        self._inner.close()
+def _read(recorded: Any, first: int) -> Read:
+    """What an entry of the log says of one input."""
+    if isinstance(recorded, str):
+        return Outcome(recorded)
+    epoch, version = recorded
+    return epoch - first, version

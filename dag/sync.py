@@ -78,7 +78,7 @@ class GetRecentDagProcessor(Processor):
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits in a replay alone, for what the recorded run read."""
         read = self.recorded_reads(trigger).get(self._name) if self.recorded_reads is not None else None
-        if read is None:
+        if not isinstance(read, tuple):
             return False
 
         def begin(on_end: Callable[[Waiting], None]) -> Waiting:
@@ -164,10 +164,15 @@ class AlignDagProcessor(Processor):
         self._timeout, self._tolerance = round(config.timeout_ms * 1e6), round(config.tolerance_ms * 1e6)
         self._partial = config.partial
         self._waits: dict[str, Waiting] = {}
+        self._ended: dict[str, Outcome] = {}
 
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits for all inputs at once."""
-        recorded = None if self.recorded_reads is None else self.recorded_reads(trigger)
+        recorded = None
+        if self.recorded_reads is not None:
+            reads = self.recorded_reads(trigger)
+            recorded = {name: read for name, read in reads.items() if isinstance(read, tuple)}
+            self._ended = {name: read for name, read in reads.items() if isinstance(read, Outcome)}
 
         def begin(name: str, on_end: Callable[[Waiting], None]) -> Waiting:
             handle = self._inputs[name]
@@ -193,11 +198,13 @@ class AlignDagProcessor(Processor):
         """Gives what was found. OK if all was; else SHUTDOWN, TIMEOUT or MISS, and what is absent is counted."""
         waits, self._waits = self._waits, {}
         stream = getattr(self.context, "stream", None)
-        ended = {name: waits[name].outcome if name in waits else None for name in self._inputs}
-        outcomes = {name: outcome or Outcome.TIMEOUT for name, outcome in ended.items()}
+        outcomes, self._ended = self._ended, {}
+        outcomes.update({name: waiting.outcome for name, waiting in waits.items() if waiting.outcome is not None})
+        outcomes = {name: outcomes.get(name, Outcome.TIMEOUT) for name in self._inputs}
         found = {name: waiting.entry for name, waiting in waits.items() if waiting.entry is not None}
         found = {name: found[name] for name in self._inputs if name in found}
-        self.reads.update({name: (entry.epoch, entry.version) for name, entry in found.items()})
+        for name, outcome in outcomes.items():
+            self.reads[name] = (found[name].epoch, found[name].version) if name in found else outcome
         absent = [name for name in self._inputs if name not in found]
         for name in absent:
             self.losses.count(self.place, f"{name} {outcomes[name].value}", trigger.version)

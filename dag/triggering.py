@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -16,10 +17,37 @@ _REMEMBERED = 256
 
 Offer = Callable[[Trigger], None]
 _Order = tuple[int, int]
+_new_trigger = partial(tuple.__new__, Trigger)  # in half the time that the named tuple's own takes, which is in Python
+
+
+class _Seen:
+    """The versions that a source was told of last."""
+
+    __slots__ = ("_newest", "_orders")
+
+    def __init__(self) -> None:
+        self._newest = (-1, -1)
+        self._orders: deque[_Order] = deque(maxlen=_REMEMBERED)
+
+    def __contains__(self, order: _Order) -> bool:
+        return order <= self._newest and order in self._orders
+
+    def add(self, order: _Order) -> bool:
+        """Adds one, and tells whether it is new."""
+        if order > self._newest:
+            self._newest = order
+        elif order in self._orders:
+            return False
+        self._orders.append(order)
+        return True
 
 
 class TriggerSource:
     """Makes triggers of events, from its making on; `start` and `stop` matter to those of time alone."""
+
+    def __init__(self, offer: Offer) -> None:
+        self.offer = offer
+        """Takes the triggers."""
 
     def start(self) -> None:
         """Begins to tick."""
@@ -34,37 +62,43 @@ class AnyTrigger(TriggerSource):
     A version is settled when every input has settled it, or has gone past it without having it.
     """
 
-    def __init__(self, inputs: Mapping[str, Input], offer: Offer, after: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self,
+        inputs: Mapping[str, Input],
+        offer: Offer,
+        after: Callable[[], None] | None = None,
+        before: Callable[[], None] | None = None,
+    ) -> None:
         """Subscribes to the inputs, which must be bound.
 
         Args:
             inputs: Those that trigger, by name.
             offer: Takes the triggers, in the thread that commits or settles.
             after: Is called in that thread when the commit or settle is through.
+            before: Is called in that thread when a commit begins.
         """
         self._windows = {name: one.window for name, one in inputs.items()}
-        self._offer = offer
+        super().__init__(offer)
         self._lock = threading.Lock()
-        self._seen: dict[_Order, None] = {}
+        self._seen = _Seen()
         self._empty: dict[_Order, set[str]] = {}
         for name, window in self._windows.items():
-            window.subscribe(partial(self._on_commit, name, window.clock), partial(self._on_settle, name), after)
+            window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after, before)
 
-    def _on_commit(self, name: str, clock: Clock, entry: Entry) -> None:
+    def _on_commit(self, name: str, entry: Entry) -> None:
         version, epoch = entry.version, entry.epoch
         if not entry.triggers:
             self._on_settle(name, version, epoch)
             return
         with self._lock:
-            new = (epoch, version) not in self._seen
-            if new:
-                _remember(self._seen, (epoch, version))
+            new = self._seen.add((epoch, version))
             passed = ()
             if self._empty:
                 self._empty.pop((epoch, version), None)
                 passed = self._passed()
         if new:
-            self._offer(Trigger(version, entry.received_ns, False, epoch, clock.monotonic_ns(), {name: version}))
+            inputs = {name: version}
+            self.offer(_new_trigger((version, entry.received_ns, False, epoch, entry.committed_ns, inputs)))
         if passed:
             self._settle(passed)
 
@@ -83,7 +117,7 @@ class AnyTrigger(TriggerSource):
         passed += list(self._empty)[: max(0, len(self._empty) - len(passed) - _REMEMBERED)]
         for order in passed:
             self._empty.pop(order, None)
-            _remember(self._seen, order)
+            self._seen.add(order)
         return passed
 
     def _is_empty(self, order: _Order, settled_by: set[str]) -> bool:
@@ -91,7 +125,7 @@ class AnyTrigger(TriggerSource):
 
     def _settle(self, orders: list[_Order] | tuple[()]) -> None:
         for epoch, version in orders:
-            self._offer(Trigger(version, settled=True, epoch=epoch))
+            self.offer(Trigger(version, settled=True, epoch=epoch))
 
 
 class AllTrigger(TriggerSource):
@@ -122,13 +156,13 @@ class AllTrigger(TriggerSource):
         """
         self._windows = {name: one.window for name, one in inputs.items()}
         self._first = next(iter(inputs))
-        self._offer = offer
+        super().__init__(offer)
         self._tolerance = tolerance_ns
         self._place = place
         self._losses = losses
         self._lock = threading.Lock()
         self._pending: dict[_Order, int] = {}
-        self._seen: dict[_Order, None] = {}
+        self._seen = _Seen()
         self._bound = min(_REMEMBERED, *(window.capacity for window in self._windows.values()))
         for name, window in self._windows.items():
             window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after)
@@ -140,8 +174,7 @@ class AllTrigger(TriggerSource):
                 self._on_settle(name, entry.version, entry.epoch)
                 return
             with self._lock:
-                if order not in self._seen:
-                    _remember(self._seen, order)
+                if self._seen.add(order):
                     self._pending[order] = entry.received_ns
         self._complete()
 
@@ -149,10 +182,9 @@ class AllTrigger(TriggerSource):
         if name == self._first:
             order = (epoch, version)
             with self._lock:
-                new = order not in self._seen
-                _remember(self._seen, order)
+                new = self._seen.add(order)
             if new:
-                self._offer(Trigger(version, settled=True, epoch=epoch))
+                self.offer(Trigger(version, settled=True, epoch=epoch))
         self._complete()
 
     def _complete(self) -> None:
@@ -176,7 +208,7 @@ class AllTrigger(TriggerSource):
             self._losses.count(self._place, "incomplete", version)
             triggers.append(Trigger(version, settled=True, epoch=epoch))
         for trigger in sorted(triggers, key=lambda one: (one.epoch, one.version)):
-            self._offer(trigger)
+            self.offer(trigger)
 
     def _versions(self, order: _Order) -> dict[str, int] | None:
         """The versions that are there, by input; None when one cannot come any more."""
@@ -225,7 +257,7 @@ class TimeTrigger(TriggerSource):
             losses: Where skipped ticks are counted, as `overrun`.
         """
         self._clock = clock
-        self._offer = offer
+        super().__init__(offer)
         self._period = period_ns
         self._is_busy = is_busy
         self._place = place
@@ -267,7 +299,7 @@ class TimeTrigger(TriggerSource):
         if self._is_busy():
             self._losses.count(self._place, "overrun", version)
             trigger = trigger._replace(settled=True)
-        self._offer(trigger)
+        self.offer(trigger)
 
     def _next_version(self, now: int, missed: int) -> int:
         last = self._version
@@ -284,9 +316,3 @@ class TimeTrigger(TriggerSource):
 def _newest(window: Window) -> _Order:
     snapshot = window.snapshot()
     return snapshot.epoch, snapshot.versions[-1] if snapshot.versions else -1
-
-
-def _remember(orders: dict[_Order, None], order: _Order) -> None:
-    orders[order] = None
-    if len(orders) > _REMEMBERED:
-        del orders[next(iter(orders))]

@@ -42,7 +42,8 @@ LOSSES = "warploom/losses"
 RUNS = "warploom/runs"
 """The topic of triggers that components took: the component, and the versions that triggered, by input."""
 READS = "warploom/reads"
-"""The topic of what sync vertices read: the vertex, and epoch and version by input; None where it was left out."""
+"""The topic of what sync vertices read: the vertex, and by input epoch and version, or how the wait ended without; None
+where the vertex was left out."""
 
 _QUEUE = 64  # commits that may wait for the writer; they hold the payloads, which are in the windows anyway
 

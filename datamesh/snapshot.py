@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import deque
 from collections.abc import Iterator
 from enum import Enum
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -13,6 +14,8 @@ __all__ = ["CURRENT_EPOCH", "Entry", "Miss", "Snapshot", "State"]
 
 T = TypeVar("T")
 
+_REMEMBERED = 256
+"""How many evicted versions are known one by one."""
 CURRENT_EPOCH = -1
 """In place of an epoch: the one that the window is in."""
 
@@ -39,7 +42,7 @@ class Entry(NamedTuple, Generic[T]):
     received_ns: int
     """The clock's `monotonic_ns` when the sensor's data that it derives from was received."""
     committed_ns: int
-    """The clock's `monotonic_ns` of its own commit."""
+    """The clock's `monotonic_ns` of its own commit; of its release where it was held back."""
     epoch: int = CURRENT_EPOCH
     """Order is by epoch, then version."""
     triggers: bool = True
@@ -60,36 +63,26 @@ class Entry(NamedTuple, Generic[T]):
         return self.value
 
 
-class State(Generic[T]):
+class State(NamedTuple, Generic[T]):
     """What a window holds at one moment, in one epoch. What snapshots read of it never changes."""
 
-    __slots__ = ("entries", "epoch", "evicted", "gone", "previous", "settled", "versions")
-
-    def __init__(
-        self,
-        epoch: int,
-        versions: tuple[int, ...],
-        entries: tuple[Entry[T], ...],
-        evicted: int,
-        settled: dict[int, None],
-        gone: dict[int, None],
-        previous: State[T] | None,
-    ) -> None:
-        self.epoch = epoch
-        self.versions = versions
-        self.entries = entries
-        self.evicted = evicted
-        """The highest version that was evicted in this epoch; −1 when none was."""
-        self.settled = settled
-        self.gone = gone
-        """The versions evicted last, one by one. Shared by the states of an epoch, and the window's alone."""
-        self.previous = previous
-        """The last state of the epoch before, for those still at work on it, until this epoch fills the window."""
+    epoch: int
+    versions: tuple[int, ...]
+    """Ascending."""
+    entries: tuple[Entry[T], ...]
+    """One for each version."""
+    evicted: int
+    """The highest version that was evicted in this epoch; −1 when none was."""
+    settled: dict[int, None]
+    gone: deque[int]
+    """The versions evicted last, one by one. Shared by the states of an epoch, and the window's alone."""
+    previous: State[T] | None
+    """The last state of the epoch before, for those still at work on it, until this epoch fills the window."""
 
     @classmethod
     def empty(cls, epoch: int, previous: State[T] | None = None) -> State[T]:
         """Nothing committed, evicted or settled."""
-        return cls(epoch, (), (), -1, {}, {}, previous)
+        return cls(epoch, (), (), -1, {}, deque(maxlen=_REMEMBERED), previous)
 
     def of_epoch(self, epoch: int) -> State[T]:
         """The state of an epoch; where it is not kept, an empty one in which everything is evicted, or to come."""
@@ -98,9 +91,7 @@ class State(Generic[T]):
         if self.previous is not None and self.previous.epoch == epoch:
             return self.previous
         state: State[T] = State.empty(epoch)
-        if epoch < self.epoch:
-            state.evicted = 1 << 64
-        return state
+        return state._replace(evicted=1 << 64) if epoch < self.epoch else state
 
 
 class Snapshot(Generic[T]):

@@ -10,6 +10,7 @@ import logging
 import threading
 from bisect import bisect_left, insort
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from .clock import Clock, SystemClock
@@ -28,8 +29,11 @@ OnSettle = Callable[[int, int], None]
 
 _log = logging.getLogger(__name__)
 
+_OK = Status.OK  # a member of an enum takes longer to look up than to compare
+_new_state = partial(tuple.__new__, State)  # what a named tuple calls is written in Python, and takes twice as long
+
 _REMEMBERED = 256
-"""How many settled and how many evicted versions a window knows one by one."""
+"""How many settled versions a window knows one by one."""
 
 
 class _Held(NamedTuple):
@@ -82,6 +86,7 @@ class Window(Generic[T]):
         self._on_commit: tuple[OnCommit, ...] = ()
         self._on_settle: tuple[OnSettle, ...] = ()
         self._after: tuple[Callable[[], None], ...] = ()
+        self._before: tuple[Callable[[], None], ...] = ()
         self._waits: list[Waiting[T]] = []
         self._held: list[_Held] = []
         self._modified: set[tuple[int, int]] = set()
@@ -99,10 +104,25 @@ class Window(Generic[T]):
             stream: Where the values will be read, so that it waits for those that a device is still writing. None:
                 on the host, so the calling thread waits.
         """
-        return Snapshot(self._state.of_epoch(epoch), stream)
+        state = self._state
+        return Snapshot(state if epoch == state.epoch else state.of_epoch(epoch), stream)
+
+    def find(self, version: int, epoch: int = CURRENT_EPOCH) -> Entry[T] | None:
+        """The datum of exactly a version, if it is there now; a device may still be writing it."""
+        state = self._state
+        if epoch != state.epoch:
+            state = state.of_epoch(epoch)
+        if state.versions and state.versions[-1] == version:
+            return state.entries[-1]
+        index = bisect_left(state.versions, version)
+        return state.entries[index] if index < len(state.versions) and state.versions[index] == version else None
 
     def subscribe(
-        self, on_commit: OnCommit, on_settle: OnSettle, after: Callable[[], None] | None = None
+        self,
+        on_commit: OnCommit,
+        on_settle: OnSettle,
+        after: Callable[[], None] | None = None,
+        before: Callable[[], None] | None = None,
     ) -> Callable[[], None]:
         """Calls back after each commit that was kept, and after each settle, in the thread that made it.
 
@@ -111,6 +131,7 @@ class Window(Generic[T]):
                 of a commit before the next one to this window, so it must be short.
             on_settle: Takes the version and its epoch.
             after: Is called when that is through, and others can commit: it may take its time, which is the producer's.
+            before: Is called when a commit begins, whether or not it will be kept, by any thread.
 
         Returns:
             Ends the subscription.
@@ -120,12 +141,15 @@ class Window(Generic[T]):
             self._on_settle = (*self._on_settle, on_settle)
             if after is not None:
                 self._after = (*self._after, after)
+            if before is not None:
+                self._before = (*self._before, before)
 
         def unsubscribe() -> None:
             with self._lock:
                 self._on_commit = tuple(one for one in self._on_commit if one is not on_commit)
                 self._on_settle = tuple(one for one in self._on_settle if one is not on_settle)
                 self._after = tuple(one for one in self._after if one is not after)
+                self._before = tuple(one for one in self._before if one is not before)
 
         return unsubscribe
 
@@ -152,6 +176,8 @@ class Window(Generic[T]):
         Raises:
             ValueError: There is one of its version, and `equal` is ERROR.
         """
+        for before in self._before:
+            before()
         with self._commit_lock:
             if isinstance(policy, Reorder):
                 status = self._hold(policy, entry, equal, triggers)
@@ -165,30 +191,25 @@ class Window(Generic[T]):
         self, policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool | None = None
     ) -> Status:
         """Commits at once. Called with the commit lock held."""
+        lost: tuple[tuple[str, int], ...] = ()
+        status, oldest = _OK, None
         with self._lock:
             state = self._state
-            if entry.epoch == CURRENT_EPOCH or (policy is CommitPolicy.FORCE_NEW_EPOCH and entry.epoch < state.epoch):
-                entry = entry._replace(epoch=state.epoch)
-            if entry.epoch > state.epoch:
-                state = self._stepped(entry.epoch)
-            index = len(state.versions)
-            lost: tuple[tuple[str, int], ...] = ()
-            if entry.epoch == state.epoch and (index == 0 or entry.version > state.versions[-1]):
-                status = Status.OK
-                if triggers is not None:
-                    entry = entry._replace(triggers=triggers)
+            versions = state.versions
+            if entry.epoch == state.epoch and triggers is None and (not versions or entry.version > versions[-1]):
+                index = len(versions)  # the usual case
             else:
-                status, state, index, entry, lost = self._place(state, policy, entry, equal, triggers is True)
-            oldest = None
-            if status is Status.OK:
-                oldest = state.entries[0] if self.check and len(state.entries) == self.capacity else None
+                status, state, index, entry, lost = self._place(state, policy, entry, equal, triggers)
+            if status is _OK:
+                if self.check and len(state.entries) == self.capacity:
+                    oldest = state.entries[0]
                 entry = self._insert(state, index, entry)
         # Who watches losses may read the window, or write to it: no lock of it is held.
         if oldest is not None:
             self.verify(oldest)
         for reason, version in lost:
             self.losses.count(self.topic, reason, version)
-        if status is not Status.OK:
+        if status is not _OK:
             self.losses.count(self.topic, status.name.lower(), entry.version)
             if status is Status.DUPLICATE and equal is EqualVersion.ERROR:
                 raise ValueError(f"version {entry.version} is in {self.topic!r} already, and equal versions are errors")
@@ -203,13 +224,20 @@ class Window(Generic[T]):
         return status
 
     def _place(
-        self, state: State[T], policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool
+        self, state: State[T], policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool | None
     ) -> tuple[Status, State[T], int, Entry[T], tuple[tuple[str, int], ...]]:
-        """Where a datum that is not the newest goes: status, the state to put it in, index, entry, losses."""
+        """Where a datum goes: status, the state to put it in, index, entry, losses."""
+        if entry.epoch == CURRENT_EPOCH or (policy is CommitPolicy.FORCE_NEW_EPOCH and entry.epoch < state.epoch):
+            entry = entry._replace(epoch=state.epoch)
         refused = Status.REJECTED if policy is CommitPolicy.REJECT else Status.OUT_OF_ORDER
         if entry.epoch < state.epoch:
             return refused, state, -1, entry, ()
+        if entry.epoch > state.epoch:
+            state = self._stepped(entry.epoch)
         versions = state.versions
+        if not versions or entry.version > versions[-1]:
+            entry = entry if triggers is None else entry._replace(triggers=triggers)
+            return Status.OK, state, len(versions), entry, ()
         index = bisect_left(versions, entry.version)
         if versions[index] == entry.version:
             if equal is not EqualVersion.REPLACE:
@@ -217,7 +245,7 @@ class Window(Generic[T]):
             lost = (("replaced", entry.version),)
             return Status.OK, _without(state, index, index + 1), index, entry._replace(triggers=False), lost
         if policy is CommitPolicy.INSERT_SORTED and (index > 0 or len(versions) < self.capacity):
-            return Status.OK, state, index, entry._replace(triggers=triggers), ()
+            return Status.OK, state, index, entry._replace(triggers=triggers is True), ()
         if policy is CommitPolicy.OVERWRITE:
             lost = tuple(("overwritten", version) for version in versions[index:])
             return Status.OK, _without(state, index, len(versions)), index, entry, lost
@@ -236,7 +264,7 @@ class Window(Generic[T]):
         first = 1 if len(state.versions) >= self.capacity else 0
         if first:
             evicted = state.versions[0]
-            _remember(state.gone, evicted)
+            state.gone.append(evicted)
             previous = None
         if index == len(state.versions):  # the usual case, in half the time
             versions, entries = state.versions[first:] + (version,), state.entries[first:] + (entry,)  # noqa: RUF005
@@ -246,27 +274,33 @@ class Window(Generic[T]):
         settled = state.settled
         if settled and version in settled:
             settled = {other: None for other in settled if other != version}
-        self._state = State(state.epoch, versions, entries, evicted, settled, state.gone, previous)
+        self._state = _new_state((state.epoch, versions, entries, evicted, settled, state.gone, previous))
         return entry
 
     def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
         """Says that there will be nothing at `version`, unless there is or was something, and tells the subscribers."""
-        if epoch > self._state.epoch:
+        state = self._state
+        if state.versions and state.versions[-1] == version and epoch in (state.epoch, CURRENT_EPOCH):
+            return  # the usual case: a component settles what it has committed
+        if epoch > state.epoch:
             self.new_epoch(epoch)
         with self._lock:
             state = self._state.of_epoch(epoch)
             epoch = state.epoch
-            if version in state.settled or version in state.versions or version in state.gone:
+            if version in state.settled or version in state.versions:
+                return
+            if version <= state.evicted and version in state.gone:
                 return
             if any(held.order == (epoch, version) for held in self._held):
                 return
-            settled = dict(state.settled)
-            _remember(settled, version)
-            now = State(epoch, state.versions, state.entries, state.evicted, settled, state.gone, state.previous)
+            settled = {**state.settled, version: None}
+            if len(settled) > _REMEMBERED:
+                del settled[next(iter(settled))]
+            now = state._replace(settled=settled)
             if state is self._state:
                 self._state = now
             elif state is self._state.previous:
-                self._state.previous = now
+                self._state = self._state._replace(previous=now)
         for on_settle in self._on_settle:
             try:
                 on_settle(version, epoch)
@@ -297,8 +331,7 @@ class Window(Generic[T]):
         state = self._state
         if epoch <= state.epoch:
             return state
-        previous = State(state.epoch, state.versions, state.entries, state.evicted, state.settled, state.gone, None)
-        return State.empty(epoch, previous)
+        return State.empty(epoch, state._replace(previous=None))
 
     def wait(
         self, version: int, on_end: Callable[[Waiting[T]], None], epoch: int = CURRENT_EPOCH, tolerance_ns: int = 0
@@ -371,7 +404,8 @@ class Window(Generic[T]):
     def _release(self, count: int) -> None:
         for _ in range(count):
             held = self._held.pop(0)
-            self._publish(CommitPolicy.DISCARD_OUT_OF_ORDER, held.entry, held.equal, held.triggers)
+            entry = held.entry._replace(committed_ns=self.clock.monotonic_ns())
+            self._publish(CommitPolicy.DISCARD_OUT_OF_ORDER, entry, held.equal, held.triggers)
 
     def flush(self) -> None:
         """Publishes all that `Reorder` holds back."""
@@ -384,10 +418,9 @@ class Window(Generic[T]):
 
     def verify_version(self, version: int, epoch: int) -> None:
         """Does what `verify` does with the datum of a version, if it is there."""
-        snapshot = self.snapshot(epoch)
-        index = snapshot.version_index(version)
-        if index >= 0:
-            self.verify(snapshot.entry(index))
+        entry = self.find(version, epoch)
+        if entry is not None:
+            self.verify(entry)
 
     def verify(self, entry: Entry[T]) -> None:
         """Counts a datum, once, whose payload is not what it was at its commit: somebody wrote to it."""
@@ -401,13 +434,6 @@ class Window(Generic[T]):
 
 
 def _without(state: State[T], start: int, end: int) -> State[T]:
-    versions = state.versions[:start] + state.versions[end:]
-    entries = state.entries[:start] + state.entries[end:]
-    return State(state.epoch, versions, entries, state.evicted, state.settled, state.gone, state.previous)
-
-
-def _remember(versions: dict[int, None], version: int) -> None:
-    """Adds a version to a bounded memory of versions, which forgets its oldest."""
-    versions[version] = None
-    if len(versions) > _REMEMBERED:
-        del versions[next(iter(versions))]
+    return state._replace(
+        versions=state.versions[:start] + state.versions[end:], entries=state.entries[:start] + state.entries[end:]
+    )

@@ -63,7 +63,7 @@ def test_block_never_holds_more_than_its_depth():
     producer.start()
     producer.join(0.05)
     assert producer.is_alive()
-    assert len(backlog._waiting) == 3
+    assert len(backlog.waiting) == 3
     backlog.take()
     producer.join(10)
     assert not producer.is_alive()

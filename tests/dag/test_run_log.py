@@ -172,6 +172,34 @@ def test_strong_sync_ends_its_waits_as_in_the_recorded_run(write, tmp_path, monk
     assert len([event for event in recording if event.topic == READS]) > 5, "and some with"
 
 
+class Reasons(Processor):
+    """Gives why what was waited for is absent."""
+
+    extra: In[object]
+    total: Out[object]
+
+    def process(self, trigger):
+        self.total.value = [outcome.value for outcome in self.extra.value.outcomes.values()]
+        return Status.OK
+
+
+def test_why_an_input_was_absent_is_in_the_log(write, tmp_path, monkeypatch):
+    """A version each that was found, had left the window, was settled, and did not come in time."""
+
+    def run(mesh):
+        feed(mesh, "sensor/map", range(100, 140))  # the window keeps the last 32 of them
+        mesh.window("sensor/map").settle(150)
+        for version in (101, 120, 150, 160):
+            feed(mesh, "sensor/value", [version])
+            wait_for_sum(mesh, version)
+
+    text = module(ALIGN.replace("SlowSum", "Reasons"), inputs=BOTH)
+    recording, losses = check(write, tmp_path, text, run, monkeypatch, commits=4)
+    reasons = [event.value[0] for event in recording if event.topic == "made/total"]
+    assert reasons == ["evicted", "found", "settled empty", "timeout"]
+    assert losses["sums.align"] == {"map evicted": 1, "map settled empty": 1, "map timeout": 1}
+
+
 def test_ticks_of_time_come_from_the_log(write, tmp_path, monkeypatch):
     vertices = (
         "      recent: {processor: warploom.dag.GetRecentDagProcessor, out: {value: newest}, config: {input: value}}\n"

@@ -366,6 +366,19 @@ def test_in_a_replay_strong_sync_takes_what_the_recorded_run_found():
     assert aligned.absent == ("radar",)
 
 
+@pytest.mark.parametrize("outcome", [Outcome.EVICTED, Outcome.SETTLED_EMPTY, Outcome.SHUTDOWN, Outcome.TIMEOUT])
+def test_in_a_replay_what_was_absent_is_so_for_the_recorded_reason(outcome):
+    mesh = Mesh("camera", "radar")
+    mesh.commit("camera", 10)
+    mesh.commit("radar", 10)
+    waiting = Waiting(mesh)
+    waiting.processor.recorded_reads = lambda trigger: {"camera": (0, 10), "radar": outcome}
+    assert not waiting.begin(Trigger(10))
+    _, aligned = waiting.end()
+    assert aligned.outcomes == {"camera": Outcome.FOUND, "radar": outcome}
+    assert waiting.processor.losses.as_dict() == {"AlignDagProcessor": {f"radar {outcome.value}": 1}}
+
+
 def test_what_was_read_is_in_the_timings(no_thread_left):
     mesh, results, timings = Mesh("lidar", "camera", "result"), Results(), []
     component = aligning(mesh, results, on_timing=timings.append)
@@ -378,7 +391,7 @@ def test_what_was_read_is_in_the_timings(no_thread_left):
     assert reads == {
         ("align", 10): {"camera": (0, 10)},
         ("collect", 10): {},
-        ("align", 20): {},
+        ("align", 20): {"camera": Outcome.SHUTDOWN},
         ("collect", 20): {},
     }
 
