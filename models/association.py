@@ -1,17 +1,13 @@
-"""Assignment of detections to tracks: the pairs that may be, their costs, and the cheapest choice among them."""
+"""Assignment: the cheapest choice among pairs that may be."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-__all__ = ["assign", "assign_sparse"]
+__all__ = ["assign"]
 
 _NOT = -1
-# Costs of the sparse solver must not be zero; shifted by this, which both choices of every row share.
-_SHIFT = 1.0
 
 
 def assign(cost: np.ndarray) -> np.ndarray:
@@ -32,35 +28,3 @@ def assign(cost: np.ndarray) -> np.ndarray:
         made = clipped[rows, chosen] < 1.0
         columns[rows[made]] = chosen[made]
     return columns
-
-
-def assign_sparse(rows: np.ndarray, columns: np.ndarray, cost: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """`assign` for when only some pairs can be: thousands of rows and columns with a few neighbours each.
-
-    Args:
-        rows: Row of each possible pair, shape (p,).
-        columns: Its column, shape (p,); no pair comes twice.
-        cost: Its cost, finite and not negative, shape (p,).
-        shape: How many rows and columns there are.
-
-    Returns:
-        As `assign`.
-    """
-    n, m = shape
-    chosen = np.full(n, _NOT)
-    possible = cost < 1.0
-    if not possible.any():
-        return chosen
-    # Each row may also take a column of its own, which stands for staying alone: so a full matching exists.
-    every = np.arange(n)
-    graph = coo_array(
-        (
-            np.concatenate([cost[possible] + _SHIFT, np.full(n, 1.0 + _SHIFT)]),
-            (np.concatenate([rows[possible], every]), np.concatenate([columns[possible], m + every])),
-        ),
-        shape=(n, m + n),
-    ).tocsr()
-    row, column = min_weight_full_bipartite_matching(graph)
-    made = column < m
-    chosen[row[made]] = column[made]
-    return chosen

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..kernels.track_table import COSTS, MOTIONS, PARAMETERS
 from .classes import BARRIER, CLASSES, CONE, CYCLIST, PEDESTRIAN, UNKNOWN, VEHICLE
 
 __all__ = ["ClassConfig", "Parameters", "TrackerConfig"]
@@ -29,8 +30,19 @@ class ClassConfig:
     """A confirmed one ends when it is not seen for longer than this [s]."""
     report: float = 0.15
     """It is reported, as coasted, until it was not seen for longer than this [s]."""
+    motion: str = "cv"
+    """How they move: `cv`, constant velocity along the axes of the ground; `ctrv`, constant speed and turn rate along
+    the heading; `imm`, the likelier of going straight on and of turning, both along the heading."""
+    cost: str = "mahalanobis"
+    """What associates: `mahalanobis`, the distance of the centres in standard deviations, and the sizes' difference;
+    `giou`, the generalised overlap in space; `distance`, that of the centres on the ground."""
     gate: float = 3.0
-    """The largest distance of a detection from its track, in standard deviations."""
+    """For `mahalanobis`: the largest distance of a detection from its track, in standard deviations."""
+    gate_giou: float = -0.4
+    """For `giou`: the least generalised overlap, above −1."""
+    gate_distance: float = 2.5
+    """For `distance`: the largest [m], where frames are 0.1 s apart; in proportion more where
+    they are further apart."""
     association_std: float = 0.45
     """Of a detection's centre about its track's along each axis, besides the track's own uncertainty [m]; larger than
     `position_std`, for detections that are off are off by more than the filter's Gaussian."""
@@ -50,7 +62,15 @@ class ClassConfig:
     speed_std: float = 10.0
     """Of the velocity of an object seen for the first time, along each axis of the ground [m/s]; 0: it never moves."""
     acceleration_std: float = 5.0
-    """By how much a velocity changes within a second, along each axis of the ground [m/s]."""
+    """By how much a velocity changes within a second, along each axis of the ground or along the heading [m/s]."""
+    slip_std: float = 0.0
+    """By how much a place changes within a second by itself, along each axis of the ground [m]."""
+    turn_rate_std: float = 0.3
+    """Of the turn rate of an object seen for the first time, where the motion has one [rad/s]."""
+    turn_acceleration_std: float = 0.5
+    """By how much a turn rate changes within a second [rad/s]."""
+    switch_rate: float = 0.5
+    """For `imm`: how often an object goes over from going straight to turning, or back [1/s]."""
     vertical_std: float = 0.3
     """By how much a height changes within a second [m]."""
     size_drift: float = 0.2
@@ -125,15 +145,34 @@ class TrackerConfig:
         if len(self.classes) != len(CLASSES):
             raise ValueError(f"classes has {len(self.classes)} entries; expected one for each of {', '.join(CLASSES)}")
 
+        for number in range(len(self.classes) + 1):
+            _check(self.of(number), CLASSES[number] if number < len(CLASSES) else "background")
+
     def of(self, kind: int) -> ClassConfig:
         """The configuration of a class, or of the background for the number after the last class."""
         return self.background if kind == len(self.classes) else self.classes[kind]
 
 
-class Parameters:
-    """The configuration as arrays with a row for each kind: the classes, then the background.
+def _check(kind: ClassConfig, name: str) -> None:
+    for field_name, known in (("motion", MOTIONS), ("cost", COSTS)):
+        if getattr(kind, field_name) not in known:
+            raise ValueError(
+                f"{name}: {field_name} must be one of {', '.join(known)}, not {getattr(kind, field_name)!r}"
+            )
+    for field_name in ("gate", "gate_distance", "position_std", "size_std", "yaw_std", "velocity_std"):
+        if not getattr(kind, field_name) > 0.0:
+            raise ValueError(f"{name}: {field_name} must be above 0, not {getattr(kind, field_name)}")
+    if not -1.0 < kind.gate_giou < 1.0:
+        raise ValueError(f"{name}: gate_giou must be above −1 and below 1, not {kind.gate_giou}")
 
-    Those of seven columns are for x y z l w h yaw.
+
+class Parameters:
+    """The configuration as a table with a row for each kind, the classes, then the background.
+
+    Attributes:
+        table: Columns as `kernels.track_table.PARAMETERS`, shape (kinds, 28), float64.
+        min_score: Least score of each kind, shape (kinds,).
+        initial_speed_variance: Of each kind [m²/s²], shape (kinds,).
     """
 
     def __init__(self, config: TrackerConfig, *, relative: bool):
@@ -142,28 +181,46 @@ class Parameters:
         def each(name: str) -> np.ndarray:
             return np.array([getattr(kind, name) for kind in kinds], np.float64)
 
-        def nanoseconds(name: str) -> np.ndarray:
-            return np.rint(each(name) * 1e9).astype(np.int64)
-
-        def axes(ground, vertical, size, yaw) -> np.ndarray:
-            columns = (ground, ground, vertical, size, size, size, yaw)
-            return np.stack([np.broadcast_to(np.asarray(c, np.float64), len(kinds)) for c in columns], axis=1) ** 2
+        def index(name: str, known: tuple[str, ...]) -> np.ndarray:
+            return np.array([known.index(getattr(kind, name)) for kind in kinds], np.float64)
 
         speed, acceleration = each("speed_std"), each("acceleration_std")
         if relative:
             speed = np.maximum(speed, config.relative_speed_std)
             acceleration = np.maximum(acceleration, config.relative_acceleration_std)
-        self.min_score, self.high_score, self.birth_score = each("min_score"), each("high_score"), each("birth_score")
-        self.birth_hits = each("birth_hits").astype(np.int64)
-        self.tentative, self.coast, self.report = nanoseconds("tentative"), nanoseconds("coast"), nanoseconds("report")
-        self.gate = each("gate")
-        self.association_limit = np.repeat(each("association_limit")[:, None] ** 2, 3, axis=1)
-        self.association_noise = np.repeat(each("association_std")[:, None] ** 2, 3, axis=1)
+        cost = index("cost", COSTS).astype(int)
         names = [kind.group or f"class {number}" for number, kind in enumerate(kinds)]
         names[-1] = "background"
-        self.group = np.array([names.index(name) for name in names])
-        self.noise = axes(each("position_std"), each("position_std"), each("size_std"), each("yaw_std"))
-        self.drift = axes(0.0, each("vertical_std"), each("size_drift"), each("yaw_drift"))
-        self.acceleration = axes(acceleration, 0.0, 0.0, 0.0)
-        self.initial_pvv = axes(speed, 0.0, 0.0, 0.0)
-        self.velocity_noise = each("velocity_std") ** 2
+        columns = {
+            "min_score": each("min_score"),
+            "high_score": each("high_score"),
+            "birth_score": each("birth_score"),
+            "birth_hits": each("birth_hits"),
+            "tentative": np.rint(each("tentative") * 1e9),
+            "coast": np.rint(each("coast") * 1e9),
+            "report": np.rint(each("report") * 1e9),
+            "group": np.array([names.index(name) for name in names]),
+            "motion": index("motion", MOTIONS),
+            "cost": cost,
+            "limit": np.choose(cost, [each("gate"), each("gate_giou"), each("gate_distance")]),
+            "association_variance": each("association_std") ** 2,
+            "association_limit": each("association_limit") ** 2,
+            "size_weight": np.full(len(kinds), config.size_weight),
+            "position_variance": each("position_std") ** 2,
+            "size_variance": each("size_std") ** 2,
+            "yaw_variance": each("yaw_std") ** 2,
+            "velocity_variance": each("velocity_std") ** 2,
+            "speed_variance": speed**2,
+            "acceleration": acceleration**2,
+            "slip": each("slip_std") ** 2,
+            "vertical_drift": each("vertical_std") ** 2,
+            "size_drift": each("size_drift") ** 2,
+            "yaw_drift": each("yaw_drift") ** 2,
+            "turn_variance": each("turn_rate_std") ** 2,
+            "turn_acceleration": each("turn_acceleration_std") ** 2,
+            "switch_rate": each("switch_rate"),
+            "is_background": np.arange(len(kinds)) == len(kinds) - 1,
+        }
+        self.table = np.stack([columns[name] for name in PARAMETERS], axis=1).astype(np.float64)
+        self.min_score = each("min_score")
+        self.initial_speed_variance = speed**2

@@ -1,8 +1,7 @@
-"""Tracking by detection: a Kalman filter for every track, all of them in one batch, and Hungarian association.
+"""Tracking by detection: a Kalman filter for every track, all of them in one batch, and optimal association.
 
-The motion model is constant velocity. Noise is taken as independent along the world's axes, so the filter of a
-track falls apart into seven filters of one axis each (x y z l w h yaw) with position and velocity, and a frame is
-a dozen operations on arrays over all tracks instead of a loop over 10 × 10 matrices: the result is the same.
+A frame is a few launches of compiled code (`kernels.track_step`), whose tables hold all tracks; here are their memory,
+the ego's motion, and what goes in and out.
 
 Tracks live in the world's frame where the ego pose is known, so that what stands still has no velocity, however the
 vehicle moves; else in the sensor's, and then velocities are relative to it.
@@ -14,26 +13,22 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .association import assign, assign_sparse
-from .geometry import invert, transform_boxes, wrap_angle
+from ..kernels.track_step import TrackStep
+from ..kernels.track_table import COUNTS, PARAMETERS
+from .geometry import invert, transform_boxes
 from .track_config import ClassConfig, Parameters, TrackerConfig
 
 __all__ = ["ClassConfig", "Tracker", "TrackerConfig", "Tracks"]
 
-# Columns of the table of tracks: seven each of state, rate, and their covariance; x y z l w h yaw within each.
-_X, _V, _PXX, _PXV, _PVV = (slice(i, i + 7) for i in range(0, 35, 7))
-_SCORE, _VOTES, _EVIDENCE = 35, 36, 37  # the evidence: a column a class, from here on
-_YAW = 6
-# Columns of the table of what is whole: ns, and counts of frames.
-_ID, _KIND, _BORN, _SEEN, _HITS, _AGE, _CONFIRMED, _MATCHED = range(8)
-
-_MOST_VOTES = 5.0  # for a heading: so many detections the other way turn it round
 _USUAL_PERIOD = 0.1  # [s]
-_DENSE_PAIRS = 40_000  # up to here every pair is looked at; beyond, neighbours only
-_NEIGHBOURS = 12
+_SMALLEST_PLAN = 64
+_MANY = 256  # detections from which on they are looked up in their order along x
+_KIND, _MOVES = 1, 2
+_NO_POSE = np.eye(4)[:3].ravel()
+_DROPPED = COUNTS[3:7]
+_TURN_VARIANCE = PARAMETERS.index("turn_variance")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,6 +41,8 @@ class Tracks:
     """Filtered x y z l w h yaw [m, rad], shape (k, 7), float64."""
     velocities: np.ndarray
     """Along the frame's x and y [m/s]: over ground where the pose was given, else relative; shape (k, 2), float64."""
+    turn_rates: np.ndarray
+    """Of the heading [rad/s], 0 where the motion has none; shape (k,), float64."""
     scores: np.ndarray
     """Mean of the detections' scores, the latest weighing most; lower while coasting; shape (k,), float64."""
     classes: np.ndarray
@@ -58,47 +55,65 @@ class Tracks:
     """Frames with a detection, shape (k,), int32."""
     coasted: np.ndarray
     """True where this frame had no detection: the box is a prediction; shape (k,), bool."""
-    position_std: np.ndarray
-    """Standard deviation of the centre along each axis of the ground [m], shape (k,), float64."""
-    velocity_std: np.ndarray
-    """Of the velocity [m/s], shape (k,), float64."""
+    covariances: np.ndarray
+    """Of x, y and the velocity along x and y, along the frame's axes, shape (k, 4, 4), float64."""
     detections: np.ndarray
     """Row of the detection that each took up, −1 while coasting; shape (k,), int64."""
 
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def position_std(self) -> np.ndarray:
+        """Standard deviation of the centre on the ground, its mean over the directions [m], shape (k,)."""
+        return np.sqrt(0.5 * (self.covariances[:, 0, 0] + self.covariances[:, 1, 1]))
+
+    @property
+    def velocity_std(self) -> np.ndarray:
+        """Likewise of the velocity [m/s]."""
+        return np.sqrt(0.5 * (self.covariances[:, 2, 2] + self.covariances[:, 3, 3]))
+
 
 class Tracker:
     """Keeps the objects of a stream of detections apart and together.
 
-    One frame after the other goes through `update`; the same frames give the same tracks, to the byte. Detections
-    that cannot be used are dropped and counted in `dropped` by reason: `not finite`, `size not positive`,
-    `low score`, `over capacity`.
+    One frame after the other goes through `update`; the same frames give the same tracks, to the byte. What is out of
+    the ordinary is counted: in `dropped` the detections that cannot be used, by reason (`not finite`, `size not
+    positive`, `low score`, `over capacity`); in `incidents` frames, by what came to pass (`gap`: too long after the
+    last one for any track to live on; `pose missing`; `cut short`: so many objects in one place that some were assigned
+    one after the other, not at the least cost of all).
     """
 
-    def __init__(self, config: TrackerConfig | None = None):
+    def __init__(self, config: TrackerConfig | None = None, *, device: str = "cpu"):
+        """Starts without tracks.
+
+        Args:
+            config: How objects move and are associated, class by class.
+            device: The Warp device that the tracks live on.
+        """
         self.config = config or TrackerConfig()
+        self.device = device
         self.dropped: Counter[str] = Counter()
+        self.incidents: Counter[str] = Counter()
         self._kinds = len(self.config.classes)  # the background's kind comes after those of the classes
         self._in_world = Parameters(self.config, relative=False)
         self._relative = Parameters(self.config, relative=True)
         self._next_id = 1
+        self._count = 0
+        self._step = self._plan(_SMALLEST_PLAN, _SMALLEST_PLAN)
         self.clear()
 
     def clear(self) -> None:
         """Forgets all tracks and the time, for a new recording; ids go on."""
-        self._f = np.empty((0, _EVIDENCE + self._kinds))
-        self._i = np.empty((0, 8), np.int64)
+        self._count = 0
         self._version: int | None = None
         self._pose: np.ndarray | None = None
-        self._step = (np.eye(4), 1.0)  # the ego's last motion and the seconds it took
+        self._motion: tuple[np.ndarray, np.ndarray, float] | None = None  # the last two poses, seconds between them
         self._frames = 0
-        self._seconds = 0.0  # between this frame and the last
 
     def __len__(self) -> int:
         """Tracks alive, reported or not."""
-        return len(self._i)
+        return self._count
 
     def update(
         self,
@@ -109,6 +124,7 @@ class Tracker:
         *,
         background: np.ndarray | None = None,
         velocities: np.ndarray | None = None,
+        radial: np.ndarray | None = None,
         pose: np.ndarray | None = None,
     ) -> Tracks:
         """Takes up the detections of one frame.
@@ -121,6 +137,9 @@ class Tracker:
             background: True for boxes from clusters; these make and continue background tracks only; shape (n,).
             velocities: Measured velocities along the sensor's x and y [m/s], over ground if a pose is given, else
                 relative; NaN where unknown; shape (n, 2).
+            radial: Measured speeds along one direction, as of a radar: the direction along the sensor's x and y, the
+                speed along it (over ground or relative, as above), and its standard deviation [m/s]; NaN where unknown;
+                shape (n, 4).
             pose: World from sensor, shape (4, 4); None where unknown. Without it in one frame after others with
                 it, the last motion is taken to go on.
 
@@ -136,308 +155,202 @@ class Tracker:
                 f"version is {version} ns, not after the last frame's {self._version} ns: a tracker takes frames in "
                 "the order of time; call clear() before a new recording"
             )
-        z = self._measurements(boxes, scores, classes, background, velocities)
-        seconds = 0.0 if self._version is None else (version - self._version) * 1e-9
-        pose = self._move_to(pose, seconds)
-        self._version = version
-        self._frames += 1
-
-        self._seconds = seconds
-        self._predict(seconds)
-        if pose is not None:
-            z.boxes = transform_boxes(z.boxes, pose)
-            z.velocities = z.velocities @ pose[:2, :2].T
-        match = self._associate(z)
-        self._correct(z, match, version)
-        self._bury(version)
-        self._give_birth(z, match, version)
-        return self._report(version, pose)
-
-    # What comes in
-
-    def _measurements(self, boxes, scores, classes, background, velocities) -> _Measurements:
-        """Checks the detections and keeps those that can be used."""
         boxes = np.asarray(boxes, np.float64)
         if boxes.size == 0:
             boxes = boxes.reshape(0, 7)
         n = len(boxes)
         if boxes.shape != (n, 7):
             raise ValueError(f"boxes has shape {boxes.shape}; expected (n, 7): x y z l w h yaw")
-        scores = np.asarray(scores, np.float64).reshape(-1)
-        classes = np.asarray(classes, np.int64).reshape(-1)
-        background = np.zeros(n, bool) if background is None else np.asarray(background, bool).reshape(-1)
-        velocities = np.full((n, 2), np.nan) if velocities is None else np.asarray(velocities, np.float64)
-        velocities = velocities.reshape(-1, 2)
-        for name, array in (("scores", scores), ("classes", classes), ("background", background)):
-            if len(array) != n:
-                raise ValueError(f"{name} has {len(array)} entries for {n} boxes")
-        if len(velocities) != n:
-            raise ValueError(f"velocities has {len(velocities)} rows for {n} boxes")
+        scores, classes = _rows("scores", scores, n), _rows("classes", classes, n)
         if n and (classes.min() < 0 or classes.max() >= self._kinds):
             raise ValueError(f"classes holds {classes.min()} to {classes.max()}; expected 0 to {self._kinds - 1}")
-
-        kinds = np.where(background, self._kinds, classes)
-        finite = np.isfinite(boxes).all(1) & np.isfinite(scores)
-        sized = (boxes[:, 3:6] > 0).all(1)
-        strong = scores >= self._in_world.min_score[kinds]
-        keep = finite & sized & strong
-        if not keep.all():
-            self.dropped["not finite"] += int((~finite).sum())
-            self.dropped["size not positive"] += int((finite & ~sized).sum())
-            self.dropped["low score"] += int((finite & sized & ~strong).sum())
-        rows = np.flatnonzero(keep)
-        if len(rows) > self.config.max_detections:
-            self.dropped["over capacity"] += len(rows) - self.config.max_detections
-            best = np.argsort(-scores[rows], kind="stable")[: self.config.max_detections]
-            rows = np.sort(rows[best])
-        return _Measurements(rows, boxes[rows], scores[rows], classes[rows], kinds[rows], velocities[rows])
-
-    @property
-    def _parameters(self) -> Parameters:
-        return self._relative if self._pose is None else self._in_world
-
-    def _move_to(self, pose: np.ndarray | None, seconds: float) -> np.ndarray | None:
-        """The pose of this frame; where poses begin or fail, the tracks and the pose are made to fit."""
+        background = None if background is None else _rows("background", background, n)
+        velocities = None if velocities is None else _rows("velocities", velocities, n, 2)
+        radial = None if radial is None else _rows("radial", radial, n, 4)
         if pose is not None:
             pose = np.array(pose, np.float64)
             if pose.shape != (4, 4) or not np.isfinite(pose).all():
                 raise ValueError(f"pose has shape {pose.shape}; expected a finite (4, 4) matrix, world from sensor")
-            if self._pose is None and len(self._i):
-                # So far in the sensor's frame: carried over as they stand, their velocities unknown again.
-                self._f[:, _X] = transform_boxes(self._f[:, _X] + seconds * self._f[:, _V], pose)
-                self._f[:, _V] = self._f[:, _PXV] = 0.0
-                self._f[:, _PVV] = self._in_world.initial_pvv[self._i[:, _KIND]]
-            elif self._pose is not None and seconds > 0.0:
-                self._step = (invert(self._pose) @ pose, seconds)
+
+        rows = None
+        if n > self.config.max_detections:
+            rows = self._best(boxes, scores, classes, background)
+            boxes, scores, classes = boxes[rows], scores[rows], classes[rows]
+            background, velocities, radial = (a if a is None else a[rows] for a in (background, velocities, radial))
+            n = len(rows)
+        seconds = 0.0 if self._version is None else (version - self._version) * 1e-9
+        if seconds > self.config.longest_gap and self._count:
+            self._count = 0
+            self.incidents["gap"] += 1
+        pose = self._move_to(pose, seconds)
+        self._version = version
+        self._frames += 1
+        self._make_room(n)
+
+        step = self._step
+        given, whole = step.given, step.given_whole
+        given[:n, :7], given[:n, 7] = boxes, scores
+        given[:n, 8:10] = np.nan if velocities is None else velocities
+        given[:n, 10:14] = np.nan if radial is None else radial
+        whole[:n, 0], whole[:n, 1] = classes, 0 if background is None else background
+        in_order = n > _MANY
+        step.frame_real[:5] = (
+            seconds,
+            max(seconds / _USUAL_PERIOD, 1.0),
+            self.config.coasted_score,
+            self.config.class_memory,
+            self.config.score_weight,
+        )
+        step.frame_real[5:] = _NO_POSE if pose is None else pose[:3].ravel()
+        step.frame_whole[:] = (
+            version, self._count, n, self._next_id, self._frames, in_order, self.config.max_tracks,
+        )  # fmt: skip
+        if in_order:
+            along = boxes[:, :3] @ step.frame_real[5:8] + step.frame_real[8]
+            step.order[:n] = np.argsort(along, kind="stable")
+            step.send("order")
+        step.send("given", "given_whole", "frame_real", "frame_whole")
+        step.launch()
+        step.fetch("counts")
+        return self._report(rows)
+
+    # What comes in
+
+    def _best(
+        self, boxes: np.ndarray, scores: np.ndarray, classes: np.ndarray, background: np.ndarray | None
+    ) -> np.ndarray:
+        """Of more detections than there is room for the rows of the best that can be used; the others are counted."""
+        kinds = classes.astype(np.int64)
+        if background is not None:
+            kinds = np.where(background, self._kinds, kinds)
+        finite = np.isfinite(boxes).all(1) & np.isfinite(scores)
+        sized = (boxes[:, 3:6] > 0).all(1)
+        strong = scores >= self._in_world.min_score[kinds]
+        rows = np.flatnonzero(finite & sized & strong)
+        over = max(len(rows) - self.config.max_detections, 0)
+        if over:
+            best = np.argsort(-scores[rows], kind="stable")[: self.config.max_detections]
+            rows = np.sort(rows[best])
+        self._count_dropped((~finite).sum(), (finite & ~sized).sum(), (finite & sized & ~strong).sum(), over)
+        return rows
+
+    def _count_dropped(self, *counts: int) -> None:
+        self.dropped.update({reason: int(n) for reason, n in zip(_DROPPED, counts, strict=True) if n})
+
+    def _move_to(self, pose: np.ndarray | None, seconds: float) -> np.ndarray | None:
+        """The pose of this frame; where poses begin or fail, the tracks and the pose are made to fit."""
+        if (pose is None) is not (self._pose is None) or not self._frames:
+            self._use_parameters(pose is None and self._pose is None)
+        if pose is not None:
+            if self._pose is None:
+                if self._count:
+                    self._into_world(pose, seconds)
+            elif seconds > 0.0:
+                self._motion = (self._pose, pose, seconds)
         elif self._pose is not None:
-            step, over = self._step
-            pose = self._pose @ _motion_to(_motion_of(step) * (seconds / over))
+            self.incidents["pose missing"] += 1
+            pose = self._pose
+            if self._motion is not None:
+                before, after, over = self._motion
+                pose = pose @ _motion_to(_motion_of(invert(before) @ after) * (seconds / over))
         self._pose = pose
         return pose
 
-    # The filter
+    def _into_world(self, pose: np.ndarray, seconds: float) -> None:
+        """Tracks so far in the sensor's frame are carried over as they stand, their velocities unknown again."""
+        real, whole = self._step.table()
+        real, whole = real[: self._count], whole[: self._count]
+        placed = real[:, :7].copy()
+        placed[:, :2] += seconds * real[:, 7:9]
+        placed = transform_boxes(placed, pose)
+        speeds = self._in_world.initial_speed_variance[whole[:, _KIND]]
+        turning = whole[:, _MOVES] > 0
+        rates = self._in_world.table[whole[:, _KIND], _TURN_VARIANCE]
+        real[:, :7], real[:, 7:10] = placed, 0.0
+        for first in (19, 49):
+            real[:, first : first + 3] = placed[:, [0, 1, 6]]
+            real[:, first + 3 : first + 5] = 0.0
+            covariance = real[:, first + 5 : first + 30].reshape(-1, 5, 5)
+            covariance[:, 3:, :] = covariance[:, :, 3:] = 0.0
+            covariance[:, 3, 3] = speeds
+            covariance[:, 4, 4] = np.where(turning, rates, speeds)
+            real[:, first + 5 : first + 30] = covariance.reshape(-1, 25)
+        self._step.set_table(real, whole)
 
-    def _predict(self, dt: float) -> None:
-        """Moves all tracks forward by `dt` seconds."""
-        if not len(self._i):
+    # Memory
+
+    def _plan(self, tracks: int, detections: int) -> TrackStep:
+        return TrackStep(tracks=tracks, detections=detections, kinds=self._kinds + 1, device=self.device)
+
+    def _use_parameters(self, relative: bool) -> None:
+        self._step.parameters[:] = (self._relative if relative else self._in_world).table
+        self._step.send("parameters")
+
+    def _make_room(self, detections: int) -> None:
+        """A larger plan where there may be more tracks or detections than fit."""
+        tracks = min(self._count + detections, max(self.config.max_tracks, self._count))
+        step = self._step
+        if tracks <= step.tracks and detections <= step.detections:
             return
-        if dt > self.config.longest_gap:
-            self._f, self._i = self._f[:0], self._i[:0]
-            return
-        f, kinds = self._f, self._i[:, _KIND]
-        f[:, _X] += dt * f[:, _V]
-        q = self._parameters.acceleration[kinds]
-        f[:, _PXX] += dt * (2.0 * f[:, _PXV] + dt * f[:, _PVV] + dt * dt / 3.0 * q + self._parameters.drift[kinds])
-        f[:, _PXV] += dt * (f[:, _PVV] + 0.5 * dt * q)
-        f[:, _PVV] += dt * q
-        self._i[:, _AGE] += 1
-        self._i[:, _MATCHED] = -1
-
-    def _correct(self, z: _Measurements, match: np.ndarray, version: int) -> None:
-        """Corrects the tracks by their detections."""
-        tracks = np.flatnonzero(match >= 0)
-        if not len(tracks):
-            return
-        chosen = match[tracks]
-        f, i = self._f[tracks], self._i[tracks]
-        measured = z.boxes[chosen]
-        kinds = i[:, _KIND]
-        self._align_headings(f, measured, kinds)
-
-        innovation = measured - f[:, _X]
-        innovation[:, _YAW] = wrap_angle(innovation[:, _YAW])
-        pxx, pxv = f[:, _PXX].copy(), f[:, _PXV].copy()
-        gain = pxx / (pxx + self._parameters.noise[kinds])
-        rate_gain = pxv / (pxx + self._parameters.noise[kinds])
-        f[:, _X] += gain * innovation
-        f[:, _V] += rate_gain * innovation
-        f[:, _PXX] -= gain * pxx
-        f[:, _PXV] -= gain * pxv
-        f[:, _PVV] -= rate_gain * pxv
-        f[:, _YAW] = wrap_angle(f[:, _YAW])
-        self._correct_velocity(f, z.velocities[chosen], kinds)
-
-        weight = np.maximum(1.0 / (i[:, _HITS] + 1), self.config.score_weight)
-        f[:, _SCORE] += weight * (z.scores[chosen] - f[:, _SCORE])
-        f[:, _EVIDENCE:] *= self.config.class_memory
-        f[np.arange(len(f)), _EVIDENCE + z.classes[chosen]] += np.maximum(z.scores[chosen], 1e-3)
-        foreground = kinds < self._kinds
-        i[:, _KIND] = np.where(foreground, f[:, _EVIDENCE:].argmax(1), kinds)
-        i[:, _SEEN] = version
-        i[:, _HITS] += 1
-        i[:, _MATCHED] = z.rows[chosen]
-        i[:, _CONFIRMED] |= i[:, _HITS] >= self._parameters.birth_hits[kinds]
-        self._f[tracks], self._i[tracks] = f, i
-
-    def _align_headings(self, f: np.ndarray, measured: np.ndarray, kinds: np.ndarray) -> None:
-        """Turns measured boxes to their track's heading, in place; a track outvoted by detections turns round."""
-        turn = wrap_angle(measured[:, _YAW] - f[:, _YAW])
-        # A cluster has no front, and which of its sides is the longer may change from frame to frame.
-        square = kinds == self._kinds
-        if square.any():
-            quarters = np.where(square, np.rint(turn / (0.5 * np.pi)), 0.0)
-            measured[:, _YAW] -= 0.5 * np.pi * quarters
-            turn -= 0.5 * np.pi * quarters
-            swapped = (quarters.astype(np.int64) & 1).astype(bool)
-            measured[swapped, 3:5] = measured[swapped, 4:2:-1]
-        opposite = np.abs(turn) > 0.5 * np.pi
-        f[:, _VOTES] = np.minimum(f[:, _VOTES] + np.where(opposite, -1.0, 1.0), _MOST_VOTES)
-        outvoted = f[:, _VOTES] < 0.0
-        f[outvoted, _YAW] += np.pi
-        f[outvoted, _VOTES] = 1.0
-        measured[opposite & ~outvoted, _YAW] += np.pi
-
-    def _correct_velocity(self, f: np.ndarray, measured: np.ndarray, kinds: np.ndarray) -> None:
-        """Corrects x and y by a measured velocity, where there is one."""
-        known = np.isfinite(measured).all(1)
-        if not known.any():
-            return
-        rows = np.flatnonzero(known)
-        for axis in (0, 1):
-            x, v, pxx, pxv, pvv = (block.start + axis for block in (_X, _V, _PXX, _PXV, _PVV))
-            total = f[rows, pvv] + self._parameters.velocity_noise[kinds[rows]]
-            innovation = measured[rows, axis] - f[rows, v]
-            gain, rate_gain = f[rows, pxv] / total, f[rows, pvv] / total
-            f[rows, x] += gain * innovation
-            f[rows, v] += rate_gain * innovation
-            f[rows, pxx] -= gain * f[rows, pxv]
-            f[rows, pxv] -= gain * f[rows, pvv]
-            f[rows, pvv] -= rate_gain * f[rows, pvv]
-
-    # Association, birth and death
-
-    def _associate(self, z: _Measurements) -> np.ndarray:
-        """The row of `z` for each track, −1 for none: first the sure detections, then the rest for those left."""
-        match = np.full(len(self._i), -1)
-        if not len(match) or not len(z.rows):
-            return match
-        sure = z.scores >= self._parameters.high_score[z.kinds]
-        if sure.all():
-            return self._assign(np.arange(len(match)), z, np.arange(len(z.rows)))
-        first = np.flatnonzero(sure)
-        chosen = self._assign(np.arange(len(match)), z, first)
-        match[chosen >= 0] = first[chosen[chosen >= 0]]
-        left, rest = np.flatnonzero(match < 0), np.flatnonzero(~sure)
-        chosen = self._assign(left, z, rest)
-        match[left[chosen >= 0]] = rest[chosen[chosen >= 0]]
-        return match
-
-    def _assign(self, tracks: np.ndarray, z: _Measurements, detections: np.ndarray) -> np.ndarray:
-        """The cheapest assignment of some detections to some tracks: an index into `detections`, or −1."""
-        n, m = len(tracks), len(detections)
-        if not n or not m:
-            return np.full(n, -1)
-        groups, track_kinds = self._parameters.group, self._i[tracks, _KIND]
-        limit = self._parameters.association_limit[track_kinds] * max(self._seconds / _USUAL_PERIOD, 1.0) ** 2
-        spread = np.minimum(self._f[tracks, _PXX][:, :3], limit)
-        spread += self._parameters.association_noise[track_kinds]
-        scale = 1.0 / np.sqrt(spread[:, :2].max(1))
-        if n * m <= _DENSE_PAIRS:
-            same = groups[track_kinds][:, None] == groups[z.kinds[detections]]
-            cost = self._cost(
-                self._f[tracks][:, None, _X], spread[:, None], track_kinds[:, None], z.boxes[detections][None]
-            )
-            return assign(np.where(same, cost, 1.0))
-        # Beyond: neighbours only, each kind of track within its own gate.
-        tree = cKDTree(z.boxes[detections, :2])
-        reach = float((self._parameters.gate[track_kinds] / scale).max())
-        far, near = tree.query(self._f[tracks, :2], k=min(_NEIGHBOURS, m), distance_upper_bound=reach)
-        near, far = near.reshape(n, -1), far.reshape(n, -1)
-        rows, k = np.nonzero(np.isfinite(far))
-        columns = near[rows, k]
-        same = groups[track_kinds[rows]] == groups[z.kinds[detections[columns]]]
-        rows, columns = rows[same], columns[same]
-        cost = self._cost(self._f[tracks[rows], _X], spread[rows], track_kinds[rows], z.boxes[detections[columns]])
-        return assign_sparse(rows, columns, cost, (n, m))
-
-    def _cost(self, state, spread, kinds, boxes) -> np.ndarray:
-        """Mahalanobis distance of the centres, and the sizes' difference, in units of the gate (broadcasting)."""
-        away = boxes[..., :3] - state[..., :3]
-        square = (away * away / spread).sum(-1)
-        sizes = np.log(boxes[..., 3:6] / np.maximum(state[..., 3:6], 1e-2))
-        square += self.config.size_weight * (sizes * sizes).sum(-1)
-        return np.sqrt(square) / self._parameters.gate[kinds]
-
-    def _bury(self, version: int) -> None:
-        """Lets go of tracks that were not seen for too long; of unconfirmed ones sooner."""
-        if not len(self._i):
-            return
-        i, kinds = self._i, self._i[:, _KIND]
-        limit = np.where(i[:, _CONFIRMED] > 0, self._parameters.coast[kinds], self._parameters.tentative[kinds])
-        alive = version - i[:, _SEEN] <= limit
-        if not alive.all():
-            self._f, self._i = self._f[alive], self._i[alive]
-
-    def _give_birth(self, z: _Measurements, match: np.ndarray, version: int) -> None:
-        """Begins a track with every sure detection that no track took up."""
-        free = z.scores >= self._parameters.birth_score[z.kinds]
-        free[match[match >= 0]] = False
-        born = np.flatnonzero(free)
-        room = max(self.config.max_tracks - len(self._i), 0)
-        if len(born) > room:
-            self.dropped["over capacity"] += len(born) - room
-            born = np.sort(born[np.argsort(-z.scores[born], kind="stable")[:room]])
-        if not len(born):
-            return
-        kinds = z.kinds[born]
-        f = np.zeros((len(born), self._f.shape[1]))
-        f[:, _X] = z.boxes[born]
-        f[:, _PXX] = self._parameters.noise[kinds]
-        f[:, _PVV] = self._parameters.initial_pvv[kinds]
-        f[:, _SCORE] = z.scores[born]
-        f[:, _VOTES] = 1.0
-        f[np.arange(len(born)), _EVIDENCE + z.classes[born]] = np.maximum(z.scores[born], 1e-3)
-        self._correct_velocity(f, z.velocities[born], kinds)
-        i = np.zeros((len(born), 8), np.int64)
-        i[:, _ID] = np.arange(self._next_id, self._next_id + len(born))
-        i[:, _KIND] = kinds
-        i[:, _BORN] = i[:, _SEEN] = version
-        i[:, _HITS] = i[:, _AGE] = 1
-        i[:, _MATCHED] = z.rows[born]
-        # At the beginning there is nothing to wait for: what is there is there.
-        i[:, _CONFIRMED] = (self._parameters.birth_hits[kinds] <= 1) | (self._frames == 1)
-        self._next_id += len(born)
-        self._f, self._i = np.concatenate([self._f, f]), np.concatenate([self._i, i])
+        larger = self._plan(_room(tracks, step.tracks), _room(detections, step.detections))
+        larger.parameters[:] = step.parameters
+        larger.counts[:] = step.counts
+        larger.send("parameters", "counts")
+        larger.set_table(*(rows[: self._count] for rows in step.table()))
+        self._step = larger
 
     # What goes out
 
-    def _report(self, version: int, pose: np.ndarray | None) -> Tracks:
+    def _report(self, rows: np.ndarray | None) -> Tracks:
         """The confirmed tracks, in the sensor's frame."""
-        i = self._i
-        unseen = version - i[:, _SEEN]
-        shown = np.flatnonzero((i[:, _CONFIRMED] > 0) & (unseen <= self._parameters.report[i[:, _KIND]]))
-        f, i, unseen = self._f[shown], i[shown], unseen[shown]
-        boxes, velocities = f[:, _X], f[:, 7:10]
-        if pose is not None:
-            boxes = transform_boxes(boxes, invert(pose))
-            velocities = velocities @ pose[:3, :3]
-        background = i[:, _KIND] == self._kinds
+        step = self._step
+        self._count, shown, born, *dropped, cut_short = step.counts.tolist()
+        self._next_id += born
+        if any(dropped):
+            self._count_dropped(*dropped)
+            step.counts[:] = 0
+            step.send("counts")
+        if cut_short:
+            self.incidents["cut short"] += 1
+        step.fetch("report", "report_whole")
+        real, whole = step.report[:shown].copy(), step.report_whole[:shown].copy()
+        detections = whole[:, 6]
+        if rows is not None:
+            detections = np.append(rows, -1)[detections]
         return Tracks(
-            ids=i[:, _ID],
-            boxes=boxes,
-            velocities=velocities[:, :2].copy(),
-            scores=f[:, _SCORE] * np.where(unseen > 0, self.config.coasted_score, 1.0),
-            classes=f[:, _EVIDENCE:].argmax(1).astype(np.int32),
-            background=background,
-            age=i[:, _AGE].astype(np.int32),
-            hits=i[:, _HITS].astype(np.int32),
-            coasted=unseen > 0,
-            position_std=np.sqrt(f[:, _PXX.start]),
-            velocity_std=np.sqrt(f[:, _PVV.start]),
-            detections=i[:, _MATCHED],
+            ids=whole[:, 0],
+            boxes=real[:, :7],
+            velocities=real[:, 7:9],
+            turn_rates=real[:, 9],
+            scores=real[:, 10],
+            classes=whole[:, 1].astype(np.int32),
+            background=whole[:, 2].astype(bool),
+            age=whole[:, 3].astype(np.int32),
+            hits=whole[:, 4].astype(np.int32),
+            coasted=whole[:, 5].astype(bool),
+            covariances=real[:, 11:].reshape(-1, 4, 4),
+            detections=detections,
         )
 
 
-@dataclass(slots=True)
-class _Measurements:
-    """The detections of a frame that can be used."""
+def _rows(name: str, array: np.ndarray, n: int, columns: int = 0) -> np.ndarray:
+    """An argument with an entry for each box, or a row."""
+    array = np.asarray(array)
+    if columns:
+        array = np.asarray(array, np.float64).reshape(-1, columns)
+        if len(array) != n:
+            raise ValueError(f"{name} has {len(array)} rows for {n} boxes")
+        return array
+    if array.ndim != 1:
+        array = array.reshape(-1)
+    if len(array) != n:
+        raise ValueError(f"{name} has {len(array)} entries for {n} boxes")
+    return array
 
-    rows: np.ndarray  # in what was given
-    boxes: np.ndarray
-    scores: np.ndarray
-    classes: np.ndarray
-    kinds: np.ndarray  # the class, or for background the number after the last class
-    velocities: np.ndarray
+
+def _room(needed: int, now: int) -> int:
+    """Rows for as many as are needed and more, or as many as there are."""
+    return now if needed <= now else 1 << (needed - 1).bit_length()
 
 
 def _motion_of(step: np.ndarray) -> np.ndarray:
