@@ -18,6 +18,7 @@ from .device import resolve_device  # noqa: F401  (starts Warp)
 from .unchecked import at
 
 __all__ = [
+    "TOUCH",
     "Radius",
     "cell_of",
     "differ",
@@ -36,12 +37,10 @@ __all__ = [
 
 _LARGEST_CELL = wp.constant(wp.float64(2.0**30))
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))
-_BRUTE_FORCE = wp.constant(wp.int64(4096))  # pairs of points up to which nothing beats trying them all
 _SUB_LEVEL = wp.constant(wp.int64(49))  # bits of a float64 below its exponent and three bits of fraction: the level
 _LEVEL_OF_ONE = wp.constant(wp.int64(1023 << 3))
 _LEVEL_BITS = wp.constant(19)  # bits of x below its level
 _HALF_LEVEL = wp.constant(1 << 18)
-_LARGEST_SQUARE = wp.constant(wp.float64(3.0e38))
 
 
 @wp.struct
@@ -168,121 +167,120 @@ def hash_column(x: int, y: int) -> int:
     return int(((tile * _SPREAD) ^ wp.uint32((x & 511) * 512 + (y & 511))) & wp.uint32(0x3FFFFFFF))
 
 
-@wp.func
+_NEAR = """
+    using namespace wp;
+    const bool grows = radius.per_metre > 0.0;
+    const auto reach_at = [&](const vec3& p) {
+        const double x = p[0], y = p[1], z = p[2];
+        return radius.at_origin + radius.per_metre * wp::sqrt(x * x + y * y + z * z);
+    };
+    const auto reach_of = [&](const vec3& p, const vec3& q) { return wp::min(reach_at(p), reach_at(q)); };
+    // float32 decides where it is sure to agree with float64: up to one square, or from another on.
+    const auto are_near = [&](const vec3& p, const vec3& q, const float surely, const float surely_not) {
+        const float x = p[0] - q[0], y = p[1] - q[1], z = p[2] - q[2];
+        const float squared = x * x + y * y + z * z;
+        if (squared <= surely) return true;
+        if (squared > surely_not) return false;
+        const double dx = (double)p[0] - (double)q[0];
+        const double dy = (double)p[1] - (double)q[1];
+        const double dz = (double)p[2] - (double)q[2];
+        const double reach = grows ? reach_of(p, q) : 0.0;
+        return dx * dx + dy * dy + dz * dz <= (grows ? reach * reach : radius.squared);
+    };
+"""
+"""C++ with a `radius`: `are_near(p, q, radius.surely, radius.surely_not)`."""
+
+TOUCH = (
+    _NEAR
+    + """
+    const auto gap_squared = [](const vec3& p, const vec3& low, const vec3& high) {
+        float sum = 0.0f;
+        for (int axis = 0; axis < 3; ++axis) {
+            const float gap = wp::max(wp::max(low[axis] - p[axis], p[axis] - high[axis]), 0.0f);
+            sum += gap * gap;
+        }
+        return sum;
+    };
+    // Crowded cells: both sides are narrowed to what lies near the other's box before pairs are tried.
+    const auto touch_large = [&](const vec3* a, const int a_size, const vec3* b, const int b_size,
+                                 const float surely, const float surely_not) {
+        const float infinite = INFINITY;
+        vec3 low[2], high[2];
+        int left[2] = {a_size, b_size};
+        for (int axis = 0; axis < 3; ++axis) low[1][axis] = -infinite, high[1][axis] = infinite;
+        bool narrowed = true;
+        for (int turn = 0; turn < 8 && (narrowed || turn == 1); ++turn) {
+            narrowed = false;
+            for (int side = 0; side < 2; ++side) {
+                const vec3* points_of = side == 0 ? a : b;
+                const int size = side == 0 ? a_size : b_size;
+                vec3 own_low(infinite, infinite, infinite), own_high(-infinite, -infinite, -infinite);
+                int near = 0;
+                for (int i = 0; i < size; ++i) {
+                    const vec3& p = points_of[i];
+                    if (gap_squared(p, low[1 - side], high[1 - side]) > surely_not) continue;
+                    for (int axis = 0; axis < 3; ++axis) {
+                        own_low[axis] = wp::min(own_low[axis], p[axis]);
+                        own_high[axis] = wp::max(own_high[axis], p[axis]);
+                    }
+                    ++near;
+                }
+                if (near == 0) return false;
+                narrowed |= near < left[side];
+                left[side] = near;
+                low[side] = own_low;
+                high[side] = own_high;
+            }
+        }
+        for (int i = 0; i < a_size; ++i) {
+            if (gap_squared(a[i], low[1], high[1]) > surely_not) continue;
+            for (int j = 0; j < b_size; ++j)
+                if (are_near(a[i], b[j], surely, surely_not)) return true;
+        }
+        return false;
+    };
+    const auto touch = [&](const int a_begin, const int a_end, const int b_begin, const int b_end) {
+        const vec3 *a = points.data + a_begin, *b = points.data + b_begin;
+        const int a_size = a_end - a_begin, b_size = b_end - b_begin;
+        float surely = radius.surely, surely_not = radius.surely_not;
+        if (grows) {
+            // Cells of one level: theirs is the square between those at its ends.
+            const double growth = reach_of(a[0], b[0]) / radius.at_origin;
+            long long level;
+            memcpy(&level, &growth, 8);
+            level = level >> 49 << 49;
+            const long long above = level + (1ll << 49);
+            double least, most;
+            memcpy(&least, &level, 8);
+            memcpy(&most, &above, 8);
+            least *= radius.at_origin;
+            most *= radius.at_origin;
+            surely = (float)wp::min(least * least * (1.0 - 1e-6), 3.0e38);
+            surely_not = (float)(most * most * (1.0 + 1e-6));
+        }
+        // Up to some pairs nothing beats trying them all.
+        if ((long long)a_size * b_size > 4096)
+            return touch_large(a, a_size, b, b_size, surely, surely_not);
+        for (int i = 0; i < a_size; ++i)
+            for (int j = 0; j < b_size; ++j)
+                if (are_near(a[i], b[j], surely, surely_not)) return true;
+        return false;
+    };
+"""
+)
+"""C++ with a `radius` and an array of `points`: `touch(a_begin, a_end, b_begin, b_end)`."""
+
+
+@wp.func_native(_NEAR + "return are_near(p, q, radius.surely, radius.surely_not);")
 def is_near(p: wp.vec3, q: wp.vec3, radius: Radius) -> bool:
-    """Whether the distance is within the radius, as float64 decides; float32 does where it is sure to agree."""
-    x = p[0] - q[0]
-    y = p[1] - q[1]
-    z = p[2] - q[2]
-    squared = x * x + y * y + z * z
-    near = squared <= radius.surely
-    if squared > radius.surely and squared <= radius.surely_not:
-        dx = wp.float64(p[0]) - wp.float64(q[0])
-        dy = wp.float64(p[1]) - wp.float64(q[1])
-        dz = wp.float64(p[2]) - wp.float64(q[2])
-        limit = radius.squared
-        if radius.per_metre > wp.float64(0.0):
-            reach = wp.min(_reach_at(p, radius), _reach_at(q, radius))
-            limit = reach * reach
-        near = dx * dx + dy * dy + dz * dz <= limit
-    return near
-
-
-@wp.func
-def _gap_squared(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> float:
-    """The squared distance of a point to a box."""
-    gap = wp.max(wp.max(low - p, p - high), wp.vec3(0.0))
-    return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2]
-
-
-@wp.func
-def _touch_large(
-    points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius
-) -> bool:
-    """As `touch`, for crowded cells: narrows both sides to what lies near the other's box before it tries pairs."""
-    infinite = float(wp.inf)
-    a_low = wp.vec3(-infinite)
-    a_high = wp.vec3(infinite)
-    b_low = wp.vec3(-infinite)
-    b_high = wp.vec3(infinite)
-    a_left = a_end - a_begin
-    b_left = b_end - b_begin
-    turn = int(0)
-    while turn < 8:
-        low = wp.vec3(infinite)
-        high = wp.vec3(-infinite)
-        left = int(0)
-        for i in range(a_begin, a_end):
-            p = points[i]
-            if _gap_squared(p, b_low, b_high) <= radius.surely_not:
-                low = wp.min(low, p)
-                high = wp.max(high, p)
-                left += 1
-        narrowed = left < a_left
-        a_low = low
-        a_high = high
-        a_left = left
-        low = wp.vec3(infinite)
-        high = wp.vec3(-infinite)
-        left = int(0)
-        for j in range(b_begin, b_end):
-            q = points[j]
-            if _gap_squared(q, a_low, a_high) <= radius.surely_not:
-                low = wp.min(low, q)
-                high = wp.max(high, q)
-                left += 1
-        narrowed = narrowed or left < b_left
-        b_low = low
-        b_high = high
-        b_left = left
-        if a_left == 0 or b_left == 0:
-            return False
-        turn += 1
-        if not narrowed and turn > 1:
-            turn = 8
-    for i in range(a_begin, a_end):
-        p = points[i]
-        if _gap_squared(p, b_low, b_high) <= radius.surely_not:
-            for j in range(b_begin, b_end):
-                if is_near(p, points[j], radius):
-                    return True
+    """Whether the distance is within the radius, as float64 decides."""
     return False
 
 
-@wp.func
-def _touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
-    if wp.int64(a_end - a_begin) * wp.int64(b_end - b_begin) > _BRUTE_FORCE:
-        return _touch_large(points, a_begin, a_end, b_begin, b_end, radius)
-    near = bool(False)
-    i = int(a_begin)
-    while i < a_end:
-        p = at(points, i)
-        j = int(b_begin)
-        while j < b_end:
-            if is_near(p, at(points, j), radius):
-                near = True
-                j = b_end
-                i = a_end
-            j += 1
-        i += 1
-    return near
-
-
-@wp.func
+@wp.func_native(TOUCH + "return touch(a_begin, a_end, b_begin, b_end);")
 def touch(points: wp.array(dtype=wp.vec3), a_begin: int, a_end: int, b_begin: int, b_end: int, radius: Radius) -> bool:
     """Whether any point of one cell is within the radius of any point of another; of two radii the smaller holds."""
-    if radius.per_metre > wp.float64(0.0):
-        reach = wp.min(_reach_at(points[a_begin], radius), _reach_at(points[b_begin], radius))
-        level = _level_of(reach / radius.at_origin)
-        least = radius.at_origin * _growth_of(level)
-        most = radius.at_origin * _growth_of(level + 1)
-        here = Radius()
-        here.surely = float(wp.min(least * least * wp.float64(1.0 - 1e-6), _LARGEST_SQUARE))
-        here.surely_not = float(most * most * wp.float64(1.0 + 1e-6))
-        here.at_origin = radius.at_origin
-        here.per_metre = radius.per_metre
-        return _touch(points, a_begin, a_end, b_begin, b_end, here)
-    return _touch(points, a_begin, a_end, b_begin, b_end, radius)
+    return False
 
 
 @wp.func
