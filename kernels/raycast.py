@@ -281,6 +281,14 @@ class LidarCast:
         if not 0 <= world < self.worlds:
             raise ValueError(f"world must be 0 to {self.worlds - 1}, not {world}")
 
+    def scene(self, world: int = 0) -> list[Any]:
+        """What device code needs to cast rays of its own into a world: seeds, trees, the world, and its instances."""
+        self._check_world(world)
+        return [
+            self._seed, self._scene_id, world, self.max_instances, self._mesh, self._first_face, self._rows,
+            self._motion, self.meshes.labels, self._material,
+        ]  # fmt: skip
+
     def cast(self) -> None:
         """Finds what each beam hits: fills `distance`, `hit_instance`, `hit_face`, `hit_label` and `hit_normal`."""
         n = self._beams.shape[0]

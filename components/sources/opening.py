@@ -26,7 +26,8 @@ _FORMS = "sim:street?seed=7, kitti:DIR?sequence=0001, mcap:FILE, or the path of 
 def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
     """Opens a source of frames by its URI.
 
-    - `sim:SCENARIO` — the simulator; keys seed, duration [s], rate [Hz], lidar, mounting_height [m].
+    - `sim:SCENARIO` — the simulator; keys scenario, seed, duration [s], rate [Hz], lidar, mounting_height [m],
+      turning (1: sweeps take their time, as real ones do) and rain [mm/h].
     - `kitti:DIR` — a folder of the KITTI family (`KittiSource` lists the layouts); key sequence.
     - `mcap:FILE` — a recording that `warploom record` made; key topic, by default `lidar/points`.
     - `PATH` or `file:PATH` — a scan (`.bin`, `.pcd.bin`, `.npy`, `.pcd`, `.ply`) or a folder of them.
@@ -50,7 +51,8 @@ def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
     scheme, place, keys = _split(uri)
     if scheme == "sim":
         types: dict[str, Callable] = {"seed": int, "duration": _number, "rate": _number, "lidar": str}
-        options = _options(uri, keys, types | {"mounting_height": _number})
+        types |= {"scenario": str, "turning": int, "mounting_height": _number, "rain": _number}
+        options = _options(uri, keys, types)
         from .simulator import SimulatorSource
 
         try:

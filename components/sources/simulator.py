@@ -19,23 +19,23 @@ __all__ = ["SimulatorSource"]
 class SimulatorSource(Source):
     """A simulated drive; the same arguments give the same frames."""
 
-    def __init__(self, scenario: str = "street", *, device: str | None = None, **options):
+    def __init__(self, place: str = "street", /, *, device: str | None = None, **options):
         """Builds the world.
 
         Args:
-            scenario: Which one.
+            place: Which scenario, unless `options` name one.
             device: Where the rays are cast; None: the CPU.
-            options: Any of seed, duration [s], rate [Hz], lidar, mounting_height [m].
+            options: Any of scenario, seed, duration [s], rate [Hz], lidar, mounting_height [m], turning, rain [mm/h].
 
         Raises:
             ValueError: There is no such scenario or lidar, or a number makes no sense.
         """
         from ...models.simulator import PointClass, Simulator  # its kernels are compiled only when it is used
 
-        self._unscored = PointClass.VEGETATION  # as the ground score of SemanticKITTI leaves it out
-        self._simulator = Simulator(scenario=scenario, device=device or "cpu", **options)
+        self._unscored = (PointClass.VEGETATION, PointClass.NOISE)  # as the ground score of SemanticKITTI leaves it out
         said = "&".join(f"{key}={value}" for key, value in options.items())
-        super().__init__(f"sim:{scenario}" + (f"?{said}" if said else ""))
+        self._simulator = Simulator(device=device or "cpu", **{"scenario": place} | options)
+        super().__init__(f"sim:{place}" + (f"?{said}" if said else ""))
 
     @property
     def length(self) -> int:
@@ -61,6 +61,6 @@ class SimulatorSource(Source):
                 velocities=np.asarray(frame.velocities, np.float32),
                 points=np.asarray(frame.counts, np.int32),
                 ground=frame.ground,
-                ground_scored=frame.point_class != self._unscored,
+                ground_scored=~np.isin(frame.point_class, self._unscored),
             ),
         )

@@ -25,6 +25,8 @@ class PointClass(IntEnum):
     CONE = 10
     BARRIER = 11
     OTHER = 12
+    NOISE = 13
+    """An echo of no surface, as of a drop of rain."""
 
 
 GROUND_CLASSES = (PointClass.ROAD, PointClass.SIDEWALK, PointClass.TERRAIN)
@@ -96,11 +98,23 @@ _PROPERTIES = {
 }
 
 
-def material_table() -> np.ndarray:
-    """The properties of each material, as the ray caster takes them, shape (256, 5)."""
+# What a film of water does to surfaces that take it: they are darker, and more of the echo goes away from the sensor.
+_WETTED = (Material.ASPHALT, Material.MARKING, Material.PAVING, Material.SOIL, Material.CONCRETE)
+_WET_REFLECTIVITY, _WET_GLOSS = 0.45, 0.5
+
+
+def material_table(wetness: float = 0.0) -> np.ndarray:
+    """The properties of each material, as the ray caster takes them, shape (256, 5).
+
+    Args:
+        wetness: Of roads, pavings, soil and concrete, from 0, dry, to 1, under a film of water.
+    """
     table = np.zeros((256, 5), np.float32)
     for material, row in _PROPERTIES.items():
         table[material] = row
+    wetted = list(_WETTED)
+    table[wetted, 0] *= 1.0 - (1.0 - _WET_REFLECTIVITY) * wetness
+    table[wetted, 3] += (_WET_GLOSS - table[wetted, 3]) * wetness
     return table
 
 

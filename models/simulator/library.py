@@ -14,7 +14,10 @@ from ..classes import BARRIER, CONE, CYCLIST, PEDESTRIAN, VEHICLE
 from . import people, structures, vegetation, vehicles
 from .mesh import Shape
 
-__all__ = ["KINDS", "Library", "Prototype", "object_class", "prototype"]
+__all__ = ["KINDS", "VISIBILITY_RAYS", "Library", "Prototype", "object_class", "prototype"]
+
+VISIBILITY_RAYS = 24
+"""Points on an object that are looked at to tell how much of it is visible."""
 
 _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "tree": vegetation.tree,
@@ -57,6 +60,8 @@ class Prototype:
     """The corners that its bounding box can touch, shape (h, 3)."""
     size: np.ndarray
     """Length, width, height of its bounding box [m], shape (3,)."""
+    surface: np.ndarray
+    """Points spread over its faces, shape (`VISIBILITY_RAYS`, 3); none of what is background."""
 
 
 def object_class(kind: str) -> int:
@@ -86,9 +91,10 @@ def prototype(kind: str, variant: int, phase: int = 0) -> Prototype:
     else:
         shape = people.pedestrian(phase, random, walking=kind == "pedestrian")
     low, high = shape.bounds()
-    return Prototype(
-        shape, _hull(shape.vertices[shape.boxed]) if object_class(kind) >= 0 else np.empty((0, 3)), high - low
-    )
+    nothing = np.empty((0, 3))
+    if object_class(kind) < 0:
+        return Prototype(shape, nothing, high - low, nothing)
+    return Prototype(shape, _hull(shape.vertices[shape.boxed]), high - low, _surface(shape))
 
 
 def _hull(vertices: np.ndarray) -> np.ndarray:
@@ -97,15 +103,26 @@ def _hull(vertices: np.ndarray) -> np.ndarray:
     return vertices[ConvexHull(vertices).vertices]
 
 
+def _surface(shape: Shape) -> np.ndarray:
+    """Points at even steps of the area of all faces taken in turn."""
+    a, b, c = shape.vertices[shape.faces].transpose(1, 0, 2)
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    steps = (np.arange(VISIBILITY_RAYS) + 0.5) / VISIBILITY_RAYS * area[-1]
+    face = np.searchsorted(area, steps)
+    random = np.random.default_rng(0)
+    u, v = np.sort(random.random((2, VISIBILITY_RAYS)), axis=0)[..., None]
+    return u * a[face] + (v - u) * b[face] + (1 - v) * c[face]
+
+
 class Library:
-    """Prototypes as meshes on a device, and a place for the ground of the present scene."""
+    """Prototypes as meshes on a device, and a place for the ground of each present scene."""
 
     max_ground_faces = 40_000
     """Triangles that a ground may have."""
 
-    def __init__(self, device: str = "cpu"):
-        self.meshes = MeshSet(device, max_faces=1 << 21)
-        self.ground = self.meshes.reserve(self.max_ground_faces)
+    def __init__(self, device: str = "cpu", grounds: int = 1):
+        self.meshes = MeshSet(device, max_faces=(1 << 21) + grounds * self.max_ground_faces)
+        self.grounds = [self.meshes.reserve(self.max_ground_faces) for _ in range(grounds)]
         self._numbers: dict[tuple[str, int, int], int] = {}
 
     def number(self, kind: str, variant: int, phase: int = 0) -> int:

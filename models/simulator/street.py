@@ -182,8 +182,7 @@ def random_street(
     style: str,
     extent: tuple[float, float],
     duration: float = 0.0,
-    crossings: int = 1,
-    parked: float = 0.6,
+    crossings: int | list[tuple[float, float]] = 1,
     hilly: float = 1.0,
     bend: float = 1.0,
     parking: tuple[bool, bool] | None = None,
@@ -197,8 +196,7 @@ def random_street(
         style: One of `STYLES`.
         extent: Where it begins and ends [m].
         duration: For how long things will move [s].
-        crossings: Number of side streets.
-        parked: Share of the places along the curb that are taken.
+        crossings: Number of side streets, or where along the street they are and half their width [m].
         hilly: Factor on slopes.
         bend: Factor on the curvature.
         parking: Whether cars park on the left and on the right; None draws it.
@@ -211,8 +209,8 @@ def random_street(
     half_width = (
         half_width or random.uniform(3.0, 3.9) + (2.2 if any(parking) else 0.0) + (random.random() < 0.15) * 3.2
     )
-    places = []
-    for _ in range(crossings):
+    places = [] if isinstance(crossings, int) else list(crossings)
+    for _ in range(crossings if isinstance(crossings, int) else 0):
         at = random.uniform(extent[0] + 25, extent[1] - 25)
         if all(abs(at - other) > 30 for other, _ in places):
             places.append((float(at), float(random.uniform(2.6, 4.5))))

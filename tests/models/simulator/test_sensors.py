@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from warploom.models.simulator.sensors import LIDARS, lidar_model
 
@@ -13,7 +14,7 @@ def test_beams_follow_the_tables(name):
     assert lidar.lines in (16, 32, 40, 64, 90, 128)
     assert len(directions) == lidar.lines * lidar.columns
     assert np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
-    assert np.allclose(np.rad2deg(np.arcsin(directions[:, 2])), lidar.elevation[ring], atol=1e-3)
+    assert np.allclose(np.rad2deg(np.arcsin(directions[:, 2])), lidar.elevation[ring], atol=2e-3)
     assert np.all(np.diff(lidar.elevation) > 0)
     assert fraction.min() == 0
     assert fraction.max() < 1
@@ -24,11 +25,45 @@ def test_beams_follow_the_tables(name):
 def test_the_sensor_turns_clockwise_from_behind(name):
     lidar = lidar_model(name)
     directions, ring, fraction = lidar.beams
-    one = ring == lidar.lines // 2
-    azimuth = np.unwrap(np.arctan2(directions[one, 1], directions[one, 0])[np.argsort(fraction[one])])
-    steps = np.rad2deg(np.diff(azimuth))
-    assert np.allclose(steps, -360.0 / lidar.columns, atol=1e-3)
-    assert abs(abs(np.rad2deg(azimuth[0])) - 180) <= lidar.azimuth_offset + 1e-3
+    offsets = np.broadcast_to(lidar.azimuth_offset, lidar.lines)
+    for line in (0, lidar.lines // 2, lidar.lines - 1):
+        one = ring == line
+        assert np.all(np.diff(fraction[one]) > 0)
+        azimuth = np.unwrap(np.arctan2(directions[one, 1], directions[one, 0]))
+        steps = np.rad2deg(np.diff(azimuth))
+        assert np.allclose(steps, -360.0 / lidar.columns, atol=1e-3)
+        behind = (np.rad2deg(azimuth[0]) - offsets[line] + 360.0) % 360.0
+        assert behind == pytest.approx(180.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "elevation", "azimuth"),
+    [
+        ("VLP16.yaml", "vlp16", 1e-6, 1e-6), ("VLP32.yaml", "vlp32", 1e-3, 1e-3), ("VLS128.yaml", "vls128", 1e-3, 1e-3),
+        # Of one device each: off their nominal ones by up to a tenth of a degree.
+        ("Pandar64.csv", "pandar64", 0.15, 1e-3), ("PandarXT32.csv", "xt32", 0.1, 0.15),
+        ("PandarQT64.csv", "qt64", 0.02, None),
+    ],
+)  # fmt: skip
+def test_tables_are_those_of_devices(shared_data, file, name, elevation, azimuth):
+    path = shared_data / "packets" / "calibration" / file
+    if path.suffix == ".yaml":
+        lasers = yaml.safe_load(path.read_text())["lasers"]
+        rows = np.rad2deg([[laser["vert_correction"], laser["rot_correction"]] for laser in lasers])
+    else:
+        lines = [line.split(",") for line in path.read_text().splitlines()[1:]]
+        rows = np.array([[float(line[1]), -float(line[2])] for line in lines if len(line) >= 3])  # clockwise
+    rows = rows[np.argsort(rows[:, 0])]
+    lidar = lidar_model(name)
+    assert np.allclose(lidar.elevation, rows[:, 0], atol=elevation)
+    if azimuth is not None:
+        assert np.allclose(lidar.azimuth_offset, rows[:, 1], atol=azimuth)
+
+
+def test_a_footprint_reaches_its_neighbour_by_divergence_and_step():
+    lidar = lidar_model("hdl64")
+    assert lidar.edge_share == pytest.approx(2e-3 / np.deg2rad(0.167))
+    assert all(0 < other.edge_share <= 1 for other in LIDARS.values())
 
 
 def test_the_hdl64_has_two_blocks():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from warploom.models.classes import CLASSES, PEDESTRIAN, VEHICLE
-from warploom.models.simulator import LIDARS, PointClass, Simulator, lidar_model, sample_scene
-from warploom.models.simulator.simulator import SimulatedFrame
+from warploom.models.simulator import LIDARS, PointClass, SimulatedFrame, Simulator, lidar_model, sample_scene
 
 OBJECT_CLASSES = (
     PointClass.VEHICLE, PointClass.PEDESTRIAN, PointClass.CYCLIST, PointClass.CONE, PointClass.BARRIER,

@@ -9,9 +9,7 @@ from warploom.models.simulator.street import STYLES, phase_of, random_street, tr
 
 
 def build(seed, style, duration=0.0):
-    street, plan = random_street(
-        np.random.default_rng(seed), style=style, extent=(-60.0, 60.0), duration=duration, parked=0.7
-    )
+    street, plan = random_street(np.random.default_rng(seed), style=style, extent=(-60.0, 60.0), duration=duration)
     populate(street, plan, walkers=10, riders=4, cars=6, works=1)
     furnish(street, plan, 0.7)
     return street, plan
