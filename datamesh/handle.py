@@ -12,6 +12,7 @@ from __future__ import annotations
 import operator
 import threading
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
@@ -30,6 +31,8 @@ __all__ = ["Accessor", "Change", "Input", "Output", "declared_handles"]
 T = TypeVar("T")
 P = TypeVar("P")
 _NOTHING: Any = object()
+_REJECTED = Status.REJECTED
+_new_entry = partial(tuple.__new__, Entry)  # in half the time that the named tuple's own takes, which is in Python
 
 
 class Accessor(Generic[T]):
@@ -347,10 +350,9 @@ class Output(_Handle[T]):
         now = window.clock.monotonic_ns()
         received = now if change._received_ns is None else change._received_ns
         epoch = window.epoch if change._epoch == CURRENT_EPOCH else change._epoch
-        status = window.commit(
-            policy, Entry(version, value, received, now, epoch, True, change._completion), equal, triggers
-        )
-        if status is Status.REJECTED:
+        entry = _new_entry((version, value, received, now, epoch, True, change._completion, None))
+        status = window.commit(policy, entry, equal, triggers)
+        if status is _REJECTED:
             change._closed = False
         return status
 
