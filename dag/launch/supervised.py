@@ -143,6 +143,11 @@ class SupervisedProcess:
         return None if self._life is None else self._life.process.pid
 
     @property
+    def may_be_missing(self) -> bool:
+        """Whether the others go on without it now that it has ended."""
+        return self.state is State.ENDED and self.spec.exception_handler == "ignore"
+
+    @property
     def uptime_s(self) -> float | None:
         """Since its latest start [s]."""
         return None if self._life is None else time.monotonic() - self._life.started

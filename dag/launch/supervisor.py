@@ -165,6 +165,8 @@ class Supervisor:
         """When all are ready, lets them start one after the other."""
         for process in self.processes.values():
             await process.wait_for(State.READY)
+            if process.state is not State.READY and not process.may_be_missing:
+                return  # the node ends, and nothing of it has started
         for name in self.start_order():
             process = self.processes[name]
             if process.state is State.READY:
