@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from ..errors import ModelError
 from .classes import CLASSES
+from .onnx_file import NotOnnxError, external_data, opset
 
 __all__ = ["DEFAULT_CARD", "DecodeSpec", "HeadCard", "InputSpec", "OutputSpec", "file_sha256", "load_card", "save_card"]
 
@@ -99,6 +100,13 @@ class HeadCard(_Strict):
     """Figures, each with its protocol."""
     licence: str
 
+    @field_validator("file")
+    @classmethod
+    def _beside_the_card(cls, value: str) -> str:
+        if value != Path(value).name or value in ("", ".", ".."):
+            raise ValueError(f"must be the name of a file beside the card, not {value!r}")
+        return value
+
     @field_validator("classes")
     @classmethod
     def _classes_known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
@@ -112,37 +120,6 @@ def file_sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _opset(path: Path) -> int:
-    """The default opset of an ONNX file, read from its outermost fields alone (ModelProto.opset_import is field 8)."""
-
-    def varint(data: bytes, at: int) -> tuple[int, int]:
-        value = shift = 0
-        while True:
-            byte = data[at]
-            value |= (byte & 0x7F) << shift
-            at, shift = at + 1, shift + 7
-            if byte < 0x80:
-                return value, at
-
-    def fields(data: bytes):
-        at = 0
-        while at < len(data):
-            key, at = varint(data, at)
-            kind = key & 7
-            if kind == 0:
-                value, at = varint(data, at)
-            else:
-                size, at = varint(data, at) if kind == 2 else ({1: 8, 5: 4}[kind], at)
-                value, at = data[at : at + size], at + size
-            yield key >> 3, value
-
-    try:
-        imports = [dict(fields(value)) for field, value in fields(path.read_bytes()) if field == 8]
-        return next(int(entry[2]) for entry in imports if not entry.get(1))
-    except (IndexError, KeyError, TypeError, StopIteration) as error:
-        raise ModelError(f"{path}: this is not an ONNX model") from error
 
 
 def load_card(path: str | Path) -> tuple[HeadCard, Path]:
@@ -179,9 +156,15 @@ def load_card(path: str | Path) -> tuple[HeadCard, Path]:
             f"{model}: its sha256 is {found}, but the card {path.name} says {card.sha256}; "
             "the file was changed or is another one: fetch it again, or write a card for it"
         )
-    opset = _opset(model)
-    if opset != card.opset:
-        raise ModelError(f"{model}: its opset is {opset}, but the card {path.name} says {card.opset}")
+    content = model.read_bytes()
+    try:
+        found_opset, elsewhere = opset(content), external_data(content)
+    except NotOnnxError as error:
+        raise ModelError(f"{model}: this is not an ONNX model: {error}") from error
+    if found_opset != card.opset:
+        raise ModelError(f"{model}: its opset is {found_opset}, but the card {path.name} says {card.opset}")
+    if elsewhere:
+        raise ModelError(f"{model}: its weights lie in other files, which the card's sha256 does not cover")
     return card, model
 
 

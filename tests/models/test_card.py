@@ -70,6 +70,8 @@ def test_a_missing_model_and_a_missing_card_are_named(card_path):
         ({"decode__nms_iou": 2.0}, "decode.nms_iou"),
         ({"surprise": 1}, "surprise"),
         ({"sha256": "abc"}, "sha256"),
+        ({"file": "../pillar_center.onnx"}, "file: .*must be the name of a file beside the card"),
+        ({"file": "/etc/passwd"}, "file: .*must be the name of a file beside the card"),
     ],
 )
 def test_a_card_that_does_not_fit_is_refused(card_path, changes, message):
@@ -108,6 +110,30 @@ def test_what_is_not_a_model_is_refused(card_path):
     edit(card_path, sha256=hashlib.sha256(junk).hexdigest())
     with pytest.raises(ModelError, match=r"pillar_center.onnx"):
         DetectionHead(card_path, threads=1)
+
+
+def test_weights_in_other_files_are_refused(card_path):
+    import hashlib
+
+    import onnx
+
+    model = card_path.with_suffix(".onnx")
+    changed = onnx.load(str(model))
+    changed.graph.initializer[0].data_location = onnx.TensorProto.EXTERNAL
+    model.write_bytes(changed.SerializeToString())
+    edit(card_path, sha256=hashlib.sha256(model.read_bytes()).hexdigest())
+    with pytest.raises(ModelError, match="its weights lie in other files"):
+        load_card(card_path)
+
+
+def test_a_model_cut_off_is_refused_though_its_card_means_it(card_path):
+    import hashlib
+
+    model = card_path.with_suffix(".onnx")
+    model.write_bytes(model.read_bytes()[:-100])
+    edit(card_path, sha256=hashlib.sha256(model.read_bytes()).hexdigest())
+    with pytest.raises(ModelError, match=r"pillar_center.onnx: this is not an ONNX model"):
+        load_card(card_path)
 
 
 def test_what_is_not_yaml_is_refused(tmp_path):

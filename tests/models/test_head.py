@@ -7,7 +7,7 @@ import warp as wp
 from warploom.errors import ModelError
 from warploom.models.classes import CLASSES, VEHICLE
 from warploom.models.geometry import KittiCalibration, points_in_boxes
-from warploom.models.head import PRECISIONS, DetectionHead, _providers
+from warploom.models.head import DetectionHead
 
 
 @pytest.fixture(scope="module")
@@ -122,20 +122,48 @@ def test_wrong_arguments_are_refused(head):
         head.detect_points(np.zeros((3, 2), np.float32), 1.7)
 
 
-def test_a_network_on_a_gpu_computes_in_the_precision_that_was_asked_for(caplog):
-    cuda, both = ["CUDAExecutionProvider", "CPUExecutionProvider"], ["TensorrtExecutionProvider"]
-    both += cuda
-    assert _providers(cuda, 1, "fp32") == [
-        ("CUDAExecutionProvider", {"device_id": 1, "use_tf32": 0}), "CPUExecutionProvider",
-    ]  # fmt: skip
-    assert _providers(both, 0, "tf32")[0] == ("CUDAExecutionProvider", {"device_id": 0, "use_tf32": 1})
-    assert _providers(both, 0, "fp16")[0] == ("TensorrtExecutionProvider", {"device_id": 0, "trt_fp16_enable": True})
-    assert not caplog.records
-    assert _providers(cuda, 0, "fp16")[0][1]["use_tf32"] == 1
-    assert "TensorRT" in caplog.text
-    for precision in PRECISIONS:
-        assert _providers(["CPUExecutionProvider"], 0, precision) == ["CPUExecutionProvider"]
-        assert _providers(both, None, precision) == ["CPUExecutionProvider"]
+def test_clouds_of_a_batch_are_found_as_each_by_itself(scenes):
+    """The same network in one run; 1e-3 m and 1e-4 of the score are for the order of its sums."""
+    one = DetectionHead(threads=2, score_threshold=0.3)
+    three = DetectionHead(threads=2, score_threshold=0.3, batch=3)
+    together = three.detect_batch([points for points, _, _ in scenes], [height for _, height, _ in scenes])
+    for found, (points, height, _) in zip(together, scenes, strict=True):
+        alone = one.detect_points(points, height)
+        assert len(found) == len(alone) > 0
+        assert found.classes.tolist() == alone.classes.tolist()
+        np.testing.assert_allclose(found.scores, alone.scores, atol=1e-4)
+        np.testing.assert_allclose(found.boxes[:, :6], alone.boxes[:, :6], atol=1e-3)
+
+
+def test_a_batch_may_be_smaller_than_there_is_room_for(scenes):
+    head = DetectionHead(threads=2, score_threshold=0.3, batch=2)
+    points, height, _ = scenes[2]
+    assert len(head.detect_batch([points], [height])) == 1
+    with pytest.raises(ValueError, match="clouds must be 1 to 2"):
+        head.detect_batch([points] * 3, [height] * 3)
+    with pytest.raises(ValueError, match="clouds must be 1 to 2"):
+        head.detect_batch([points], [])
+    with pytest.raises(ValueError, match="batch must be 1 to 127"):
+        DetectionHead(batch=0)
+
+
+def test_the_head_reads_its_grid_where_it_was_drawn(head, scenes):
+    """No copy of the input: the array bound to the network is the plan's own, and DLPack shows the same memory."""
+    points, height, _ = scenes[0]
+    head.detect_points(points, height)
+    grid = head._slots[0].pillars.grid
+    assert head._grids.ptr == grid.ptr
+    assert np.from_dlpack(grid).ctypes.data == grid.ptr
+
+
+def test_a_missing_provider_is_said_or_refused(caplog):
+    head = DetectionHead(providers=("tensorrt", "cuda", "cpu"))
+    assert head.provider == "cpu"
+    assert head.fallback == "no provider tensorrt, cuda here: the network runs on cpu"
+    assert head.fallback in caplog.text
+    assert DetectionHead().fallback == ""
+    with pytest.raises(ModelError, match="none of the providers cuda is there for device cpu"):
+        DetectionHead(providers=("cuda",))
 
 
 def test_a_precision_that_there_is_not_is_refused():

@@ -119,7 +119,7 @@ def test_agrees_with_the_kit_itself():
         return DetectionBox(
             sample_token=token, translation=tuple(row[:3]), size=(row[4], row[3], row[5]),
             rotation=tuple(Quaternion(axis=[0, 0, 1], angle=row[6])), velocity=tuple(velocity),
-            detection_name="car", detection_score=score, attribute_name="",
+            detection_name="car", detection_score=float(score), attribute_name="",
         )  # fmt: skip
 
     rng = np.random.default_rng(3)
