@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import json
 import math
 import struct
@@ -194,13 +195,18 @@ def _put_array(array: np.ndarray, parts: list[Any], place: Place | None) -> None
         raise TypeError(f"an array of {array.dtype}: Python objects have no bytes of their own")
     where = None if place is None or not array.size else place(array)
     parts.append(b"a" if where is None else b"r")
-    _put(_dtype_text(array.dtype), parts, 0)
+    parts.append(_dtype_bytes(array.dtype))
     parts.append(_COUNT.pack(array.ndim) + b"".join(_SIZE.pack(size) for size in array.shape))
     if where is not None:
         parts.append(_COUNT.pack(where[0]) + _SIZE.pack(where[1]))
         return
     # A view of the memory: it is copied once, when the parts are joined. Dates have no buffer, bytes have.
     parts.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.size else b"")
+
+
+@functools.lru_cache(maxsize=256)
+def _dtype_bytes(dtype: np.dtype) -> bytes:
+    return encode(_dtype_text(dtype))
 
 
 def _dtype_text(dtype: np.dtype) -> Any:
@@ -214,6 +220,15 @@ def _plain(part: Any) -> Any:
 
 
 def _dtype_of(text: Any) -> np.dtype:
+    return _dtype_named(text) if isinstance(text, str) else _dtype_described(text)
+
+
+@functools.lru_cache(maxsize=256)
+def _dtype_named(text: str) -> np.dtype:
+    return _dtype_described(text)
+
+
+def _dtype_described(text: Any) -> np.dtype:
     try:
         dtype = np.lib.format.descr_to_dtype(text if isinstance(text, str) else _fields_of(text))
     except Exception as error:

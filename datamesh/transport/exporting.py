@@ -26,7 +26,7 @@ from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
 from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
-from .slabs import Lease, Slab, SlabArena, SlabPool
+from .slabs import Lease, Slab, SlabArena, SlabPool, Usage
 from .wire import COMMIT, INLINE, MESSAGE, RELEASE, SETTLE, Event, pack_event, pack_greeting, read_greeting
 
 __all__ = ["ExportService", "Exporter"]
@@ -144,8 +144,7 @@ class Exporter:
         self._readers: list[_Reader] = []
         self._reached: dict[str, tuple[int, int]] = {}
         self._stopped = False
-        self._last_arena: SlabArena | None = None
-        self._usual_copy = 0
+        self._built = self._copied = Usage()
         self._listener = listen(node, window.topic)
         try:
             self._order = OrderFile(node, window.topic)
@@ -161,6 +160,7 @@ class Exporter:
     def counters(self) -> Mapping[str, int]:
         """What was sent, copied and dropped so far, and how many read."""
         with self._lock:
+            self._collect_all()
             return {**self._counts, "readers": len(self._readers), "slabs": self._pool.used}
 
     def stop(self) -> None:
@@ -179,16 +179,15 @@ class Exporter:
     # Memory
 
     def _arena(self) -> SlabArena:
-        usual = self._last_arena.size if self._last_arena is not None else 0
-        self._last_arena = SlabArena(self._lease, usual, partial(self._count, "no_memory"))
-        return self._last_arena
+        arena = SlabArena(self._lease, self._built.size, partial(self._count, "no_memory"))
+        self._built = arena.used
+        return arena
 
     def _lease(self, size: int) -> Lease | None:
         with self._lock:
             if self._stopped:
                 return None
-            for reader in tuple(self._readers):
-                self._collect(reader)
+            self._collect_all()
             slab = self._pool.take(size)
             return None if slab is None else self._pool.lease(slab)
 
@@ -212,9 +211,10 @@ class Exporter:
         with self._lock:
             if self._stopped:
                 return
-            epoch = self._order.epoch(epoch, version)
-            for reader in tuple(self._readers):
-                self._send(reader, Event(SETTLE, 0, epoch, version, 0, 0))
+            seen = self._order.settled(epoch, version)
+            if seen is not None:
+                for reader in tuple(self._readers):
+                    self._send(reader, Event(SETTLE, 0, seen, version, 0, 0))
 
     def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]) -> None:
         """Sends a datum to readers."""
@@ -263,7 +263,7 @@ class Exporter:
                 slabs.append(slab)
             return numbers[slab.offset]
 
-        arena = SlabArena(lease, self._usual_copy, lambda: None)
+        arena = SlabArena(lease, self._copied.size, lambda: None)
 
         def place(array: np.ndarray) -> tuple[int, int] | None:
             found = self._pool.locate(array)
@@ -280,8 +280,8 @@ class Exporter:
         value = entry.read()  # on the host, so what a device still writes is waited for
         body: bytes | memoryview = encode(value, place)
         size = 0
-        self._counts["copied"] += arena.size > 0
-        self._usual_copy = arena.size
+        self._counts["copied"] += arena.used.size > 0
+        self._copied = arena.used
         if len(body) > INLINE:
             one = lease(len(body))
             one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
@@ -295,7 +295,7 @@ class Exporter:
     # Readers
 
     def _accept(self) -> None:
-        with suppress(BlockingIOError):
+        with suppress(OSError):  # it is gone again, or the export has ended
             connection, _ = self._listener.accept()
             keep_from_children(connection)
             connection.setblocking(False)
@@ -336,6 +336,9 @@ class Exporter:
                 connection.close()
                 return
             self._counts["connections"] += 1
+            for other in tuple(self._readers):
+                if other.name == reader.name:  # if it is its life before, it is to be noticed first
+                    self._collect(other)
             self._service.watch(connection, select.EPOLLRDHUP, lambda: self._gone(reader))
             self._readers.append(reader)
             self._send_history(reader)
@@ -394,6 +397,10 @@ class Exporter:
             reader.slabs[slab.offset] += 1
             reader.held += 1
         return True
+
+    def _collect_all(self) -> None:
+        for reader in tuple(self._readers):
+            self._collect(reader)
 
     def _collect(self, reader: _Reader) -> None:
         """Takes back the slabs that a reader has let go of; all of them where it is gone."""

@@ -13,6 +13,7 @@ import socket
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from ...errors import SourceError
@@ -28,6 +29,9 @@ from .wire import MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, re
 __all__ = ["Importer", "publish"]
 
 _log = logging.getLogger(__name__)
+
+_STOP_S = 5.0
+"""How long a component whose backlog blocks may keep the thread that receives."""
 
 
 class _Connection:
@@ -92,6 +96,7 @@ class Importer:
         self._counts: Counter[str] = Counter()
         self._stopping = threading.Event()
         self._connection: _Connection | None = None
+        self._socket: socket.socket | None = None
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._complaint = ""
@@ -106,10 +111,13 @@ class Importer:
         """Ends receiving. What was received stays."""
         self._stopping.set()
         with self._lock:
-            if self._connection is not None:
-                self._connection.socket.shutdown(socket.SHUT_RDWR)
+            if self._socket is not None:
+                with suppress(OSError):
+                    self._socket.shutdown(socket.SHUT_RDWR)
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(_STOP_S)
+            if self._thread.is_alive():
+                _log.error("%s: who reads it hangs: the thread that receives it is left to itself", self._window.topic)
             self._thread = None
 
     def counters(self) -> Mapping[str, int]:
@@ -134,7 +142,7 @@ class Importer:
                 self._receive(connection)
             finally:
                 with self._lock:
-                    self._connection = None
+                    self._connection = self._socket = None
                     connection.socket.close()
                 del connection
 
@@ -142,12 +150,16 @@ class Importer:
         one = connect(self._node, self._window.topic)
         if one is None:
             return None
+        with self._lock:
+            if self._stopping.is_set():
+                one.close()
+                return None
+            self._socket = one
         try:
             if peer_of(one)[1] != os.getuid():
                 raise SourceError(
                     f"topic {self._window.topic!r} is exported by another user, whom this one must not trust"
                 )
-            one.settimeout(2.0)
             hello = {
                 "topic": self._window.topic,
                 "reader": self._name,
@@ -162,17 +174,16 @@ class Importer:
                 for fd in fds:
                     os.close(fd)
             one.settimeout(None)
-            with self._lock:
-                if self._stopping.is_set():
-                    one.close()
-                    return None
-                self._connection = connection
+            self._connection = connection
             return connection
-        except TimeoutError:
-            one.close()
-            raise SourceError(f"the process that exports {self._window.topic!r} does not answer") from None
-        except BaseException:
-            one.close()
+        except BaseException as error:
+            with self._lock:
+                self._socket = None
+                one.close()
+            if self._stopping.is_set():
+                return None
+            if isinstance(error, TimeoutError):
+                raise SourceError(f"the process that exports {self._window.topic!r} does not answer") from None
             raise
 
     def _welcomed(self, one: socket.socket, data: bytes, fds: list[int]) -> _Connection | None:
@@ -207,18 +218,18 @@ class Importer:
             if missing > 0:
                 self._counts["missed"] += missing
                 self._window.losses.count(self._window.topic, "link_missed", event.version, missing)
-            self._counts["received"] += 1
-            self._counts["received_bytes"] += len(data)
             if event.kind == SETTLE:
                 self._window.settle(event.version, event.epoch)
-                continue
-            try:
-                value = _value(connection, event)
-            except ValueError as error:
-                self._damaged(event.version, error)
-                continue
-            publish(self._window, event, value)
-            del value
+            else:
+                try:
+                    value = _value(connection, event)
+                except ValueError as error:
+                    self._damaged(event.version, error)
+                    continue
+                publish(self._window, event, value)
+                del value
+            self._counts["received"] += 1
+            self._counts["received_bytes"] += len(data)
 
     def _damaged(self, version: int, error: ValueError) -> None:
         if not self._counts["damaged"]:

@@ -48,6 +48,8 @@ def _close_inherited() -> None:
 
 os.register_at_fork(after_in_child=_close_inherited)
 
+_ANSWER_S = 2.0
+"""How long a process that listens may take to answer."""
 _CREDENTIALS = struct.Struct("3i")
 _ORDER = struct.Struct("<8sQQ")
 _MAGIC = b"warploom"
@@ -64,7 +66,9 @@ def run_folder(node: str) -> Path:
     if not node or node in (".", "..") or "/" in node or "\0" in node:
         raise ConfigError(f"{node!r} cannot be the name of a node: it becomes the name of a folder")
     own, runtime = os.environ.get("WARPLOOM_RUN"), os.environ.get("XDG_RUNTIME_DIR")
-    base = Path(own) if own else Path(runtime) / "warploom" if runtime else Path(f"/tmp/warploom-{os.getuid()}")
+    base = (
+        Path(own).absolute() if own else Path(runtime or "/tmp", "warploom" if runtime else f"warploom-{os.getuid()}")
+    )
     folder = base / node
     try:
         for one in (base, folder):
@@ -104,17 +108,23 @@ def _address(path: Path) -> Iterator[str]:
 
 
 def connect(node: str, topic: str) -> socket.socket | None:
-    """A connection to who exports a topic; None where nobody does."""
+    """A connection to who exports a topic; None where nobody does.
+
+    Raises:
+        OSError: Somebody does, and does not answer.
+    """
     return _connected(_path(node, topic, "socket"))
 
 
 def _connected(path: Path) -> socket.socket | None:
+    """A connection; None where no process listens. Raises OSError where one does, and does not answer."""
     one = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     keep_from_children(one)
+    one.settimeout(_ANSWER_S)
     try:
         with _address(path) as address:
             one.connect(address)
-    except (FileNotFoundError, ConnectionRefusedError, ConnectionResetError, BlockingIOError):
+    except (FileNotFoundError, ConnectionRefusedError):
         one.close()
         return None
     except BaseException:
@@ -130,7 +140,10 @@ def listen(node: str, topic: str) -> socket.socket:
         ConfigError: A process that lives exports the topic.
     """
     path = _path(node, topic, "socket")
-    other = _connected(path)
+    try:
+        other = _connected(path)
+    except OSError as error:
+        raise ConfigError(f"topic {topic!r} of node {node!r} is exported already, by a process that hangs") from error
     if other is not None:
         pid = peer_of(other)[0]
         other.close()
@@ -168,13 +181,17 @@ def peer_of(connection: socket.socket) -> tuple[int, int]:
 
 def exported_topics(node: str) -> list[str]:
     """The topics that a live process exports, sorted."""
-    found = []
-    for path in _links(node).glob("*.socket"):
+    return sorted(unquote(path.stem) for path in _links(node).glob("*.socket") if _is_alive(path))
+
+
+def _is_alive(path: Path) -> bool:
+    try:
         one = _connected(path)
-        if one is not None:
-            one.close()
-            found.append(unquote(path.stem))
-    return sorted(found)
+    except OSError:
+        return True
+    if one is not None:
+        one.close()
+    return one is not None
 
 
 def reap(node: str) -> list[str]:
@@ -189,9 +206,7 @@ def reap(node: str) -> list[str]:
     for path in sorted(folder.iterdir()):
         if path.suffix == ".order":
             continue
-        one = _connected(path)
-        if one is not None:
-            one.close()
+        if _is_alive(path):
             alive = True
         elif path.suffix == ".socket" or not Path(f"/proc/{path.suffix[1:]}").exists():
             removed.append(path)
@@ -234,6 +249,12 @@ class OrderFile:
             self._reached = order
             _ORDER.pack_into(self._map, 0, _MAGIC, *order)
         return order[0]
+
+    def settled(self, epoch: int, version: int) -> int | None:
+        """The same for a settled version; None where the life before had reached it, and it is no news."""
+        if self._offset is not None:
+            return epoch + self._offset
+        return epoch if self._before is None or (epoch, version) > self._before else None
 
     def _decide(self, epoch: int, version: int) -> int:
         if self._before is None or (epoch, version) > self._before:

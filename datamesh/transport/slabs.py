@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["PAGE", "Lease", "Region", "Slab", "SlabArena", "SlabPool"]
+__all__ = ["PAGE", "Lease", "Region", "Slab", "SlabArena", "SlabPool", "Usage"]
 
 PAGE = 4096
 """The smallest slab [B]; each is a power of two of them, and lies at a multiple of its size."""
@@ -220,6 +220,16 @@ class SlabPool:
         return (slab, inside) if inside + array.nbytes <= slab.size else None
 
 
+class Usage:
+    """How much memory a change took, for the next one to know; it holds none of it."""
+
+    __slots__ = ("size",)
+
+    def __init__(self) -> None:
+        self.size = 0
+        """[B]."""
+
+
 class SlabArena:
     """The memory of one change: its arrays lie one behind the other, in one slab where they fit."""
 
@@ -235,8 +245,7 @@ class SlabArena:
         self._expected = expected
         self._on_full = on_full
         self._room: np.ndarray = np.empty(0, np.uint8)
-        self.size = 0
-        """What the arrays take so far [B]."""
+        self.used = Usage()
 
     def array(self, shape: Any, dtype: Any) -> np.ndarray:
         """An array in the slab, not written yet; of the process's own memory where there is no room."""
@@ -249,12 +258,12 @@ class SlabArena:
         size = math.prod(shape) * dtype.itemsize
         taken = -(-size // _ALIGNMENT) * _ALIGNMENT
         if taken > len(self._room):
-            lease = self._lease(max(taken, self._expected - self.size))
+            lease = self._lease(max(taken, self._expected - self.used.size))
             if lease is None:
                 self._on_full()
                 return np.empty(shape, dtype)
             self._room = lease.bytes()
         array = self._room[:size].view(dtype).reshape(shape)
         self._room = self._room[taken:]
-        self.size += taken
+        self.used.size += taken
         return array

@@ -1,0 +1,164 @@
+"""Meshes that are linked, in one process and in several, each node in a folder of its own."""
+
+import json
+import os
+import pathlib
+import queue
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from warploom.dag.launch.linking import LinkPlan, Links
+from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
+from warploom.datamesh.transport import SharedMemoryConfig
+
+PEER = pathlib.Path(__file__).with_name("peer.py")
+PATIENCE = 30.0  # [s] for what takes milliseconds on a machine that is not busy
+
+
+def until(condition, what="it"):
+    """Waits until a condition holds; fails when it does not in a long time."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
+        time.sleep(0.002)
+
+
+class Side:
+    """One mesh and its links."""
+
+    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), **config):
+        self.mesh = DataMesh(capacity)
+        self.plan = LinkPlan(tuple(exports), tuple(imports), tuple(blocking))
+        config = SharedMemoryConfig(**{"memory_bytes": 1 << 24, "retry_ms": 2.0, **config})
+        self.links = Links(self.mesh, self.plan, node=node, name=name, shared_memory=config)
+        self.commits = {}
+        self.settled = {}
+        for topic in imports:
+            self.commits[topic], self.settled[topic] = [], []
+            self.mesh.window(topic).subscribe(
+                lambda entry, topic=topic: self.commits[topic].append((entry.epoch, entry.version, entry.triggers)),
+                lambda version, epoch, topic=topic: self.settled[topic].append((epoch, version)),
+            )
+        self.links.start()
+
+    def output(self, topic):
+        output = Output()
+        output.bind("output", self.mesh.window(topic))
+        return output
+
+    def input(self, topic):
+        handle = Input()
+        handle.bind("input", self.mesh.window(topic))
+        return handle
+
+    def commit(self, topic, version, value, policy=CommitPolicy.DISCARD_OUT_OF_ORDER, **options):
+        output = self.output(topic)
+        with output.allocate_change() as change:
+            change.set_version(version)
+            change.value = value(change) if callable(value) else value
+            return output.commit(policy, change, **options)
+
+    def counts(self, topic):
+        return self.links.counters()[topic]
+
+    def until(self, condition, topic, what=None):
+        until(lambda: condition(self.counts(topic)), what or f"{topic}: {self.counts(topic)}")
+
+
+@pytest.fixture
+def node(tmp_path, monkeypatch):
+    """The name of a node that has a folder of its own."""
+    monkeypatch.setenv("WARPLOOM_RUN", str(tmp_path / "run"))
+    return "node"
+
+
+@pytest.fixture
+def side(node):
+    """Makes meshes of the node with their links; all end with the test."""
+    sides = []
+
+    def make(name, *, of=node, **options):
+        sides.append(Side(of, name, **options))
+        return sides[-1]
+
+    yield make
+    for one in sides:
+        one.links.stop()
+
+
+@pytest.fixture
+def linked(side):
+    """A writer and a reader of `topic`, connected."""
+
+    def make(**options):
+        writer = side("writer", exports=["topic"], **options)
+        reader = side("reader", imports=["topic"], **options)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        return writer, reader
+
+    return make
+
+
+class Peer:
+    """Another process, which says as JSON lines what it does."""
+
+    def __init__(self, arguments, environment):
+        self.process = subprocess.Popen(
+            [sys.executable, str(PEER), *map(str, arguments)], stdout=subprocess.PIPE, text=True, env=environment
+        )
+        self.pid = self.process.pid
+        self._lines = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self):
+        for line in self.process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def next(self):
+        """What it says next; None at its end."""
+        line = self._lines.get(timeout=PATIENCE)
+        return None if line is None else json.loads(line)
+
+    def wait_for(self, key):
+        """What it says next that has a key."""
+        while (told := self.next()) is not None:
+            if key in told:
+                return told
+        raise AssertionError(f"it ended without saying {key!r}")
+
+    def rest(self):
+        """All that it said until its end."""
+        told = []
+        while (one := self.next()) is not None:
+            told.append(one)
+        return told
+
+    def kill(self):
+        """Ends it as `kill -9` does."""
+        self.process.kill()
+        self.process.wait(PATIENCE)
+        self._thread.join(PATIENCE)
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def peer(node):
+    """Starts other processes of the node; all are dead at the end of the test."""
+    peers = []
+
+    def start(*arguments, of=node):
+        one = Peer((of, *arguments), {**os.environ})
+        peers.append(one)
+        return one
+
+    try:
+        yield start
+    finally:
+        for one in peers:
+            one.kill()
