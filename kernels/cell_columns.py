@@ -119,6 +119,75 @@ def _layout_of(bounds: wp.array(dtype=wp.vec4i), parts: int, has_levels: int, mo
     return layout
 
 
+# A block of points at a time, without a branch, which a compiler makes vector instructions of.
+@wp.func_native("""
+    constexpr int BLOCK = 256, NOWHERE = -2147483647 - 1;
+    constexpr double FAR = 1073741824.0;
+    const double inverse_side = radius.inverse_side;
+    const unsigned char* __restrict include = has_include ? include_in.data : nullptr;
+    int low[3] = {2147483647, 2147483647, 2147483647}, high[3] = {NOWHERE, NOWHERE, NOWHERE};
+    const char* row = (const char*)xyz_in.data + (long long)first * xyz_in.strides[0];
+    float along[3][BLOCK];
+    int cell[3][BLOCK], usable[BLOCK];
+    for (int start = first; start < last; start += BLOCK) {
+        const int length = last - start < BLOCK ? last - start : BLOCK, left = used - start;
+        for (int k = 0; k < length; ++k, row += xyz_in.strides[0])
+            for (int axis = 0; axis < 3; ++axis) along[axis][k] = ((const float*)row)[axis];
+        for (int k = 0; k < length; ++k) {
+            const float x = along[0][k], y = along[1][k], z = along[2][k];
+            usable[k] = ((x - x) + (y - y) + (z - z) == 0.0f) & (k < left);
+        }
+        if (include != nullptr)
+            for (int k = 0; k < length; ++k) usable[k] &= include[start + k] != 0;
+        int far = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            int least = low[axis], most = high[axis];
+            for (int k = 0; k < length; ++k) {
+                const double scaled = (double)(usable[k] ? along[axis][k] : 0.0f) * inverse_side;
+                const bool is_far = (scaled >= FAR) | (scaled <= -FAR);
+                far |= (int)is_far;
+                const int whole = (int)(is_far ? 0.0 : scaled);
+                const int index = whole - (scaled < (double)whole);
+                cell[axis][k] = index;
+                const int at_least = usable[k] ? index : 2147483647, at_most = usable[k] ? index : NOWHERE;
+                least = at_least < least ? at_least : least;
+                most = at_most > most ? at_most : most;
+            }
+            low[axis] = least;
+            high[axis] = most;
+        }
+        if (far) return false;
+        wp::vec3i* __restrict out = cells_out.data + start;
+        int* __restrict number = cell_of_point.data + start;
+        for (int k = 0; k < length; ++k) {
+            out[k][0] = usable[k] ? cell[0][k] : NOWHERE;
+            out[k][1] = cell[1][k];
+            out[k][2] = cell[2][k];
+            number[k] = -1;  // of points that take part it is set later
+        }
+    }
+    const int level = low[0] <= high[0] ? 0 : low[0];
+    bounds_out.data[2 * part] = wp::vec4i(low[0], low[1], low[2], level);
+    bounds_out.data[2 * part + 1] = wp::vec4i(high[0], high[1], high[2], low[0] <= high[0] ? 0 : high[0]);
+    return true;
+""")
+def _find_near_cells(
+    part: int,
+    first: int,
+    last: int,
+    used: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    include_in: wp.array(dtype=wp.uint8),
+    has_include: int,
+    radius: Radius,
+    cells_out: wp.array(dtype=wp.vec3i),
+    cell_of_point: wp.array(dtype=wp.int32),
+    bounds_out: wp.array(dtype=wp.vec4i),
+) -> bool:
+    """As `_find_cells` for the points first … last − 1 and one radius; False where a point is too far out for that."""
+    return False
+
+
 @wp.kernel
 def _find_cells(
     part: int,
@@ -138,6 +207,14 @@ def _find_cells(
     """Finds the cell of each point, and their extent."""
     n = xyz_in.shape[0]
     used = wp.min(count_in[0], n)
+    i = n * part // parts
+    end = n * (part + 1) // parts
+    if part == 0:
+        point_count_out[0] = n
+    if radius.per_metre == wp.float64(0.0) and _find_near_cells(
+        part, i, end, used, xyz_in, include_in, has_include, radius, cells_out, cell_of_point, bounds_out
+    ):
+        return
     low_x = int(_MOST)
     low_y = int(_MOST)
     low_z = int(_MOST)
@@ -146,8 +223,6 @@ def _find_cells(
     high_y = int(_LEAST)
     high_z = int(_LEAST)
     high_level = int(_LEAST)
-    i = n * part // parts
-    end = n * (part + 1) // parts
     while i < end:
         point = xyz_in[i]
         usable = i < used and is_finite(point)
@@ -175,8 +250,6 @@ def _find_cells(
         i += 1
     bounds_out[2 * part] = wp.vec4i(low_x, low_y, low_z, low_level)
     bounds_out[2 * part + 1] = wp.vec4i(high_x, high_y, high_z, high_level)
-    if part == 0:
-        point_count_out[0] = n
 
 
 @wp.kernel
@@ -330,6 +403,61 @@ def _column_begin(order: wp.array(dtype=wp.int32), cells: wp.array(dtype=wp.vec3
     return begin
 
 
+@wp.func_native("""
+    const int* __restrict index = order.data;
+    const wp::vec3i* __restrict cell_of = cells.data;
+    const char* __restrict rows = (const char*)xyz_in.data;
+    const long long stride = xyz_in.strides[0];
+    wp::vec3* __restrict point = points.data;
+    wp::vec2i* __restrict stack = stacks.data;
+    wp::vec4i* __restrict column = columns.data;
+    int* __restrict number = cell_of_point.data;
+    // Each part leaves a place free after its cells, for where the last one ends.
+    int c = begin + part - 1, k = begin - 1, first = 0;
+    int x = -2147483647 - 1, y = 0, z = 0;
+    if (begin < end) stack[c + 1][1] = begin;
+    for (int place = begin; place < end; ++place) {
+        const int i = index[place];
+        const float* row = (const float*)(rows + i * stride);
+        point[place][0] = row[0];
+        point[place][1] = row[1];
+        point[place][2] = row[2];
+        const int here[3] = {cell_of[i][0], cell_of[i][1], cell_of[i][2]};
+        // No branch: there is no telling, and the processor has many of these on their way at once.
+        const bool new_column = (here[0] != x) | (here[1] != y);
+        c += new_column | (here[2] != z);
+        k += new_column;
+        first = new_column ? c : first;
+        x = here[0];
+        y = here[1];
+        z = here[2];
+        stack[c][0] = z;
+        stack[c + 1][1] = place + 1;
+        column[k][0] = x;
+        column[k][1] = y;
+        column[k][2] = first;
+        column[k][3] = c + 1;
+        number[i] = c;
+    }
+    if (begin < end) stack[c + 1][0] = 0;
+    ranges.data[part] = wp::vec4i(begin + part, c + 1, begin, k + 1);
+""")
+def _list_cells(
+    part: int,
+    begin: int,
+    end: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    cells: wp.array(dtype=wp.vec3i),
+    order: wp.array(dtype=wp.int32),
+    cell_of_point: wp.array(dtype=wp.int32),
+    points: wp.array(dtype=wp.vec3),
+    stacks: wp.array(dtype=wp.vec2i),
+    columns: wp.array(dtype=wp.vec4i),
+    ranges: wp.array(dtype=wp.vec4i),
+):
+    """Lists the cells and columns of the sorted points begin … end − 1."""
+
+
 @wp.kernel
 def _sort_high(
     part: int,
@@ -345,7 +473,6 @@ def _sort_high(
     next_place: wp.array2d(dtype=wp.int32),
     order: wp.array(dtype=wp.int32),
     cell_of_point: wp.array(dtype=wp.int32),
-    sorted_cells: wp.array(dtype=wp.vec3i),
     points: wp.array(dtype=wp.vec3),
     stacks: wp.array(dtype=wp.vec2i),
     columns: wp.array(dtype=wp.vec4i),
@@ -387,43 +514,7 @@ def _sort_high(
                 put(place, entry[0], place_of + 1)
                 put(order, place_of, entry[1])
             k += 1
-    # Each part leaves a place free after its cells, for where the last one ends.
-    c = begin + part - 1
-    k = begin - 1
-    x = int(_NOWHERE)
-    y = int(0)
-    z = int(0)
-    column_begin = int(0)
-    place_of = begin
-    # Without a branch the processor has many of these on their way at once.
-    while place_of < end:
-        i = at(order, place_of)
-        put(points, place_of, xyz_in[i])
-        put(sorted_cells, place_of, at(cells, i))
-        place_of += 1
-    place_of = begin
-    while place_of < end:
-        cell = at(sorted_cells, place_of)
-        if cell[0] != x or cell[1] != y:
-            if k >= begin:
-                columns[k] = wp.vec4i(x, y, column_begin, c + 1)
-            k += 1
-            c += 1
-            x = cell[0]
-            y = cell[1]
-            z = cell[2]
-            column_begin = c
-            put(stacks, c, wp.vec2i(z, place_of))
-        elif cell[2] != z:
-            c += 1
-            z = cell[2]
-            put(stacks, c, wp.vec2i(z, place_of))
-        put(cell_of_point, at(order, place_of), c)
-        place_of += 1
-    if end > begin:
-        columns[k] = wp.vec4i(x, y, column_begin, c + 1)
-        put(stacks, c + 1, wp.vec2i(0, end))
-    ranges[part] = wp.vec4i(begin + part, c + 1, begin, k + 1)
+    _list_cells(part, begin, end, xyz_in, cells, order, cell_of_point, points, stacks, columns, ranges)
 
 
 def parts_for(capacity: int) -> int:
@@ -467,7 +558,6 @@ class CellColumns:
         """Of each part its first cell, the one after its last, its first column, and the one after its last."""
         self.layout = wp.empty(1, dtype=Layout, device=DEFAULT_DEVICE)
         self._bounds = buffer(2 * self.parts, wp.vec4i)
-        self._sorted_cells = buffer(dtype=wp.vec3i)
         self._digits = buffer(dtype=wp.vec2i)
         self._by_low = buffer(dtype=wp.vec2i)
         self._low_counts, self._high_counts, self._next_place = (buffer((self.parts, digits)) for _ in range(3))
@@ -503,7 +593,6 @@ class CellColumns:
                     self._next_place,
                     self.order,
                     self.cell_of_point,
-                    self._sorted_cells,
                     self.points,
                     self.stacks,
                     self.columns,
