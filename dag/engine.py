@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 from ..datamesh import Status
 from .deadline import FrameDeadline
-from .processor import Processor, Read, Wiring
+from .processor import Processor, Wiring
+from .recorded_reads import Read
 from .trigger import Trigger
 
 __all__ = ["GraphEngine", "Run", "Vertex", "VertexTiming"]

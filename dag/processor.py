@@ -17,14 +17,13 @@ from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, 
 
 from pydantic import BaseModel, ConfigDict
 
-from ..datamesh import Input, LossCounters, Outcome, Output, Status
+from ..datamesh import Input, LossCounters, Output, Status
+from .recorded_reads import Read, RecordedReads
 from .trigger import Trigger
 
-__all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "Read", "Wiring", "declared_ports"]
+__all__ = ["In", "Out", "Processor", "ProcessorConfig", "ProcessorHarness", "Wiring", "declared_ports"]
 
 T = TypeVar("T")
-Read = tuple[int, int] | Outcome
-"""Epoch and version of a datum that was read, or how the wait for it ended without."""
 _ABSENT: Any = object()
 
 
@@ -119,8 +118,8 @@ class Processor:
         """What the flag loaders of the process found."""
         self.reads: dict[str, Read] = {}
         """What this run read of inputs that did not trigger it, by input; the timings tell it."""
-        self.recorded_reads: Callable[[Trigger], Mapping[str, Read]] | None = None
-        """In a replay: what the recorded run read. It is waited for, without a deadline, and nothing else is taken."""
+        self.recorded: RecordedReads | None = None
+        """In a replay: what the recorded run read."""
         self.component_inputs: Mapping[str, Input] = {}
         self.component_outputs: Mapping[str, Output] = {}
         self.ports = declared_ports(type(self))

@@ -19,7 +19,7 @@ from ..datamesh.recording import READS, RUNS, RecordedEvent
 from .component import DagComponent, DataProcessComponent
 from .engine import VertexTiming
 from .process import Process
-from .processor import Read
+from .recorded_reads import Read, RecordedReads
 from .trigger import Trigger
 
 __all__ = ["RecordedRuns", "RunLog"]
@@ -108,11 +108,8 @@ class RecordedRuns:
         for component in process.components.values():
             for vertex in component.vertices if isinstance(component, DagComponent) else ():
                 place = f"{component.name}.{vertex.name}"
-                vertex.processor.recorded_reads = partial(self._read, place)
-                vertex.left_out = {order for order, read in self._reads[place].items() if read is None}
-
-    def _read(self, place: str, trigger: Trigger) -> Mapping[str, Read]:
-        return self._reads[place].get((trigger.epoch, trigger.version)) or {}
+                recorded = RecordedReads(self._reads[place], component.inputs)
+                vertex.processor.recorded, vertex.left_out = recorded, recorded.left_out
 
     def on_played(self, event: RecordedEvent, process: Process) -> None:
         """Gives the triggers of time that were taken here."""

@@ -77,7 +77,7 @@ class GetRecentDagProcessor(Processor):
 
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits in a replay alone, for what the recorded run read."""
-        read = self.recorded_reads(trigger).get(self._name) if self.recorded_reads is not None else None
+        read = None if self.recorded is None else self.recorded.of(trigger).get(self._name)
         if not isinstance(read, tuple):
             return False
 
@@ -90,11 +90,12 @@ class GetRecentDagProcessor(Processor):
     def process(self, trigger: Trigger) -> Status:
         """Gives value and version, or neither, which is a MISS."""
         stream = getattr(self.context, "stream", None)
-        if self.recorded_reads is None:
+        if self.recorded is None:
             found = self._look(trigger)
         else:
             waiting, self._recorded = self._recorded, None
-            found = waiting.entry if waiting is not None else None
+            kept = self.recorded.take(trigger).get(self._name)
+            found = kept or (waiting.entry if waiting is not None else None)
         if found is None:
             return Status.MISS
         self.value.value, self.version.value = found.read(stream), found.version
@@ -169,8 +170,8 @@ class AlignDagProcessor(Processor):
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits for all inputs at once."""
         recorded = None
-        if self.recorded_reads is not None:
-            reads = self.recorded_reads(trigger)
+        if self.recorded is not None:
+            reads = self.recorded.of(trigger)
             recorded = {name: read for name, read in reads.items() if isinstance(read, tuple)}
             self._ended = {name: read for name, read in reads.items() if isinstance(read, Outcome)}
 
@@ -198,11 +199,14 @@ class AlignDagProcessor(Processor):
         """Gives what was found. OK if all was; else SHUTDOWN, TIMEOUT or MISS, and what is absent is counted."""
         waits, self._waits = self._waits, {}
         stream = getattr(self.context, "stream", None)
+        found = {name: waiting.entry for name, waiting in waits.items() if waiting.entry is not None}
+        if self.recorded is not None:
+            found.update(self.recorded.take(trigger))
+        found = {name: found[name] for name in self._inputs if name in found}
         outcomes, self._ended = self._ended, {}
         outcomes.update({name: waiting.outcome for name, waiting in waits.items() if waiting.outcome is not None})
+        outcomes.update(dict.fromkeys(found, Outcome.FOUND))
         outcomes = {name: outcomes.get(name, Outcome.TIMEOUT) for name in self._inputs}
-        found = {name: waiting.entry for name, waiting in waits.items() if waiting.entry is not None}
-        found = {name: found[name] for name in self._inputs if name in found}
         for name, outcome in outcomes.items():
             self.reads[name] = (found[name].epoch, found[name].version) if name in found else outcome
         absent = [name for name in self._inputs if name not in found]

@@ -19,6 +19,7 @@ from warploom.dag import (
     Trigger,
     Vertex,
 )
+from warploom.dag.recorded_reads import RecordedReads
 from warploom.datamesh import DataMesh, Input, ManualClock, Outcome, Output, Status
 
 WAIT = 20.0
@@ -340,26 +341,26 @@ def test_in_a_replay_weak_sync_takes_what_the_recorded_run_read():
     """Not what is there now: it waits for that, however long, also for nothing."""
     mesh, resumed = Mesh("map"), []
     harness = recent(mesh, max_age_ms=0)
-    harness.processor.recorded_reads = lambda trigger: {"map": (0, 20)} if trigger.version == 30 else {}
+    harness.processor.recorded = RecordedReads({(0, 30): {"map": (0, 20)}}, mesh.inputs)
     mesh.commit("map", 10)
-    assert harness.processor.begin(Trigger(30), lambda: resumed.append(1))
+    assert harness.processor.begin(Trigger(30, epoch=0), lambda: resumed.append(1))
     mesh.clock.advance(3600 * 1000 * MS)
     assert resumed == []
     mesh.commit("map", 20, 25)
     assert resumed == [1]
-    assert harness.processor.process(Trigger(30)) is Status.OK
+    assert harness.processor.process(Trigger(30, epoch=0)) is Status.OK
     assert (harness.processor.value.value, harness.processor.version.value) == ("map 20", 20)
-    assert harness.run(Trigger(40)) == {}
+    assert harness.run(Trigger(40, epoch=0)) == {}
     assert harness.status is Status.MISS
 
 
 def test_in_a_replay_strong_sync_takes_what_the_recorded_run_found():
     mesh = Mesh("camera", "radar")
+    waiting = Waiting(mesh, tolerance_ms=5e-6)
+    waiting.processor.recorded = RecordedReads({(0, 10): {"camera": (0, 9)}}, mesh.inputs)
     mesh.commit("camera", 9, 10)
     mesh.commit("radar", 10)
-    waiting = Waiting(mesh, tolerance_ms=5e-6)
-    waiting.processor.recorded_reads = lambda trigger: {"camera": (0, 9)}
-    assert not waiting.begin(Trigger(10))
+    assert not waiting.begin(Trigger(10, epoch=0))
     status, aligned = waiting.end()
     assert status is Status.TIMEOUT
     assert aligned.versions == {"camera": 9}
@@ -369,14 +370,29 @@ def test_in_a_replay_strong_sync_takes_what_the_recorded_run_found():
 @pytest.mark.parametrize("outcome", [Outcome.EVICTED, Outcome.SETTLED_EMPTY, Outcome.SHUTDOWN, Outcome.TIMEOUT])
 def test_in_a_replay_what_was_absent_is_so_for_the_recorded_reason(outcome):
     mesh = Mesh("camera", "radar")
+    waiting = Waiting(mesh)
+    waiting.processor.recorded = RecordedReads({(0, 10): {"camera": (0, 10), "radar": outcome}}, mesh.inputs)
     mesh.commit("camera", 10)
     mesh.commit("radar", 10)
-    waiting = Waiting(mesh)
-    waiting.processor.recorded_reads = lambda trigger: {"camera": (0, 10), "radar": outcome}
-    assert not waiting.begin(Trigger(10))
+    assert not waiting.begin(Trigger(10, epoch=0))
     _, aligned = waiting.end()
     assert aligned.outcomes == {"camera": Outcome.FOUND, "radar": outcome}
     assert waiting.processor.losses.as_dict() == {"AlignDagProcessor": {f"radar {outcome.value}": 1}}
+
+
+def test_in_a_replay_what_is_still_to_be_read_stays_though_it_has_left_the_window():
+    mesh = Mesh("camera", capacity=2)
+    weak = ProcessorHarness(GetRecentDagProcessor, {"input": "camera"}, inputs=mesh.inputs)
+    strong = Waiting(mesh)
+    for processor in (weak.processor, strong.processor):
+        processor.recorded = RecordedReads({(0, 10): {"camera": (0, 10)}}, mesh.inputs)
+    mesh.commit("camera", 10, 20, 30, 40)
+    assert weak.run(Trigger(10, epoch=0)) == {"value": "camera 10", "version": 10}
+    assert not strong.begin(Trigger(10, epoch=0))
+    status, aligned = strong.end()
+    assert status is Status.OK
+    assert (aligned.values, aligned.outcomes) == ({"camera": "camera 10"}, {"camera": Outcome.FOUND})
+    assert strong.processor.recorded.take(Trigger(10, epoch=0)) == {}, "it is let go of"
 
 
 def test_what_was_read_is_in_the_timings(no_thread_left):
