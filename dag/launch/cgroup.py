@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from pathlib import Path
 
 __all__ = ["ControlGroups"]
@@ -54,10 +53,6 @@ class ControlGroups:
         folder.mkdir()
         self._made.append(folder)
 
-    def of(self, pid: int) -> str | None:
-        """The group of a process, from the top."""
-        return _own_group(pid)
-
     def close(self) -> None:
         """Removes the groups that it made, as far as nobody is in them."""
         for folder in reversed(self._made):
@@ -77,9 +72,9 @@ def _mounted() -> Path | None:
     return None
 
 
-def _own_group(pid: int | None = None) -> str:
+def _own_group() -> str:
     try:
-        for line in Path(f"/proc/{pid or os.getpid()}/cgroup").read_text().splitlines():
+        for line in Path("/proc/self/cgroup").read_text().splitlines():
             if line.startswith("0::"):
                 return line[3:]
     except OSError:

@@ -114,6 +114,8 @@ class SupervisedProcess:
         self.deaths: Counter[str] = Counter()
         """How often it died, by cause."""
         self.last_death = ""
+        self.gave_up_because = ""
+        """Why it is not started any more."""
         self.exit_code: int | None = None
         self.refused = ""
         """Why it cannot be built, as it said in its latest life."""
@@ -173,9 +175,13 @@ class SupervisedProcess:
 
     async def give_up(self, reason: str) -> None:
         """Leaves it in a final state; for when its supervision itself failed."""
-        if self._life is not None:
-            self._signal(self._life, signal.SIGKILL)
-        self.last_death = reason
+        life, self._life = self._life, None
+        if life is not None:
+            self._signal(life, signal.SIGKILL)
+            while (await life.mail.get())[0] != "exit":
+                pass
+            self._close(life)
+        self.gave_up_because = reason
         await self._enter(State.GAVE_UP, reason=reason)
 
     async def wait_for(self, *states: State) -> None:
@@ -205,6 +211,7 @@ class SupervisedProcess:
     async def _after_death(self, code: int) -> float | None:
         """What follows a death that nobody asked for: how long to wait for the next start [s]; None: there is none."""
         if self.refused and not self._ran:
+            self.gave_up_because = self.refused
             await self._enter(State.GAVE_UP, reason=self.refused)
             return None
         if self.spec.exception_handler != "respawn":
@@ -212,8 +219,8 @@ class SupervisedProcess:
             return None
         wait = self.restarts.died(time.monotonic())
         if wait is None:
-            reason = f"{self.restarts.said()} did not help; the last time it {self.last_death}"
-            await self._enter(State.GAVE_UP, reason=reason)
+            self.gave_up_because = f"{self.restarts.said()} did not help; the last time it {self.last_death}"
+            await self._enter(State.GAVE_UP, reason=self.gave_up_because)
         return wait
 
     async def _one_life(self) -> int:
@@ -453,13 +460,7 @@ class SupervisedProcess:
         with contextlib.suppress(OSError, ValueError):  # what it printed last may not have been read yet
             while data := os.read(output.fileno(), 1 << 16):
                 self._take_output(data)
-        life.output.close()
-        life.writer.close()
-        os.close(life.pidfd)
-        for answer in life.answers.values():
-            if not answer.done():
-                answer.set_exception(ConnectionError(f"process {self.name!r} ended"))
-                answer.exception()  # nobody may be waiting any more
+        self._close(life)
         if self._partial:
             self.last_lines.append(self._partial.decode(errors="replace"))
             self._partial = b""
@@ -477,6 +478,17 @@ class SupervisedProcess:
             self.last_death = reason if not asked else self.last_death
             self._tell("died", cause=cause, reason=reason, code=code, last_lines=list(self.last_lines)[-10:])
         return code
+
+    def _close(self, life: _Life) -> None:
+        life.output.close()
+        life.writer.close()
+        os.close(life.pidfd)
+        for task in life.tasks:
+            task.cancel()
+        for answer in life.answers.values():
+            if not answer.done():
+                answer.set_exception(ConnectionError(f"process {self.name!r} ended"))
+                answer.exception()  # nobody may be waiting any more
 
 
 def _cause(code: int) -> str:

@@ -163,15 +163,21 @@ class Supervisor:
 
     async def _open_gate(self) -> None:
         """When all are ready, lets them start one after the other."""
-        for process in self.processes.values():
-            await process.wait_for(State.READY)
-            if process.state is not State.READY and not process.may_be_missing:
+        processes = self.processes.values()
+        while waiting := [one for one in processes if one.state is not State.READY and not one.may_be_missing]:
+            if waiting[0].state in FINAL:
                 return  # the node ends, and nothing of it has started
+            await waiting[0].wait_for(State.READY)
         for name in self.start_order():
             process = self.processes[name]
-            if process.state is State.READY:
-                process.go()
-            await process.wait_for(State.RUNNING, State.BACKING_OFF)
+            while process.state is not State.RUNNING and process.state not in FINAL:
+                if process.state is State.READY:
+                    process.go()
+                    await process.wait_for(State.RUNNING, State.BACKING_OFF, State.BUILDING)
+                else:
+                    await process.wait_for(State.READY)
+            if process.state in FINAL and not process.may_be_missing:
+                return
         self._gate_open = True
         for process in self.processes.values():  # one that died meanwhile may be ready again
             if process.state is State.READY:
@@ -186,7 +192,7 @@ class Supervisor:
             _log.exception("the supervision of %s failed", process.name)
             await process.give_up(f"its supervision failed: {type(error).__name__}: {error}")
         if process.state is State.GAVE_UP:
-            self._end(2 if process.refused else 1, f"{process.name}: {process.refused or process.last_death}")
+            self._end(2 if process.refused else 1, f"{process.name}: {process.gave_up_because}")
         elif process.state is State.ENDED and process.spec.exception_handler == "exit":
             self._end(0 if process.exit_code == 0 else 1, f"{process.name} {process.last_death}")
         elif all(one.state in FINAL for one in self.processes.values()):

@@ -1,0 +1,256 @@
+"""A node of real processes: started together or not at all, stopped in order, killed, hanging, crashing."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from launch_nodes import DOUBLER, PLAIN, TICKER, WRITER
+
+
+def versions(path):
+    """What a component has noted, as numbers; a line that was cut off by a kill counts as none."""
+    path = Path(path)
+    return [int(line) for line in path.read_text().split()] if path.exists() else []
+
+
+@pytest.fixture
+def chain(module, launch_file, tmp_path):
+    """A launch file of three processes in a row, each noting what it has committed or recorded."""
+
+    def chain(node="node", period=20, size=16, **keys):
+        ticker = module(
+            TICKER, f"{node}_ticker", topic="ticks", journal=tmp_path / f"{node}-ticker", period=period, size=size
+        )
+        doubler = module(
+            DOUBLER, f"{node}_doubler", sent="ticks", topic="doubled", journal=tmp_path / f"{node}-doubler"
+        )
+        writer = module(WRITER, f"{node}_writer", sent="doubled", path=tmp_path / f"{node}-writer")
+        # Once a second, so that a hundred kills do not exhaust it.
+        process = {"back_off": {"first_s": 0.05}, "restarts": {"limit": 10_000}, **keys}
+        return launch_file(
+            node,
+            source={"modules": [ticker], **process},
+            middle={"modules": [doubler], **process},
+            sink={"modules": [writer], **process},
+        )
+
+    return chain
+
+
+def test_a_node_starts_consumers_first_and_stops_producers_first(start, chain, tmp_path):
+    node = start("launch", chain()).up()
+    node.wait_until(lambda: len(versions(tmp_path / "node-writer")) > 10)
+    assert node.stop() == 0
+    running = [event["process"] for event in node.find("state", state="running")]
+    assert running == ["sink", "middle", "source"]
+    assert [event["process"] for event in node.find("exited")] == ["source", "middle", "sink"]
+    # What was committed before the stop has gone through all of them.
+    assert versions(tmp_path / "node-writer") == versions(tmp_path / "node-ticker")
+    assert node.find("ended")[0]["reason"] == "SIGTERM"
+    assert node.children() == []
+    assert not (tmp_path / "run" / "node" / "control.sock").exists()
+    assert list((tmp_path / "run" / "node" / "links").iterdir()) == []
+
+
+def test_nothing_starts_if_one_process_cannot_be_built(start, module, launch_file, tmp_path):
+    good = module(PLAIN, "good", config=f"{{path: {tmp_path / 'notes'}}}")
+    bad = module(PLAIN, "bad", config="{unknown_argument: 1}")
+    node = start("launch", launch_file(one=[good], two=[bad]))
+    assert node.wait() == 2
+    assert "bad.yaml:3: components.0.config: " in node.find("ended")[0]["reason"]
+    assert not node.find("state", state="running")
+    assert not (tmp_path / "notes").exists()
+
+
+def test_a_killed_process_is_started_again_and_the_data_flow_on(start, chain, tmp_path):
+    node = start("launch", chain()).up()
+    for name in ("source", "middle", "sink"):
+        count = len(versions(tmp_path / "node-writer"))
+        node.wait_until(lambda count=count: len(versions(tmp_path / "node-writer")) > count + 5)
+        before = node.process(name)
+        os.kill(before["pid"], signal.SIGKILL)
+        died = node.wait_for("died", process=name)
+        assert (died["cause"], died["reason"]) == ("signal 9", "was ended by SIGKILL")
+        node.wait_for("state", 2, process=name, state="running")
+        after = node.process(name)
+        assert after["pid"] != before["pid"]
+        assert (after["restarts"], after["deaths"]) == (1, {"signal 9": 1})
+    count = len(versions(tmp_path / "node-writer"))
+    node.wait_until(lambda: len(versions(tmp_path / "node-writer")) > count + 5)
+    assert node.stop() == 0
+
+
+def kill_in_turn(node, chain_folder, times):
+    """Kills each process of the chain so often in turn, and looks at what must hold after each time."""
+    supervisor = psutil.Process(node.supervisor.pid)
+    fds = []
+    for round_number in range(1, times + 1):
+        for name in ("source", "middle", "sink"):
+            seen = len(versions(chain_folder / "node-writer"))
+            node.wait_until(lambda seen=seen: len(versions(chain_folder / "node-writer")) > seen + 3)
+            os.kill(node.process(name)["pid"], signal.SIGKILL)
+            node.wait_for("died", round_number, process=name, cause="signal 9")
+            node.wait_for("state", round_number + 1, process=name, state="running")
+        # The connection that asked may still be closing: the least of some looks counts.
+        looks = []
+        for _ in range(5):
+            time.sleep(0.02)
+            looks.append((supervisor.num_fds(), supervisor.num_threads()))
+        fds.append(min(looks))
+        zombies = [one for one in supervisor.children() if one.status() == psutil.STATUS_ZOMBIE]
+        assert zombies == []
+        assert len(supervisor.children(recursive=True)) == 3
+    assert max(fds[len(fds) // 2 :]) <= max(fds[: max(1, len(fds) // 2)]), f"descriptors grow: {fds}"
+    return fds
+
+
+def recorded_of_committed(folder):
+    """Looks whether each link lost only what it may; gives how much was committed and recorded."""
+    sent, doubled, recorded = (versions(folder / f"node-{name}") for name in ("ticker", "doubler", "writer"))
+    # Whatever comes out was once put in, in order and once.
+    assert set(doubled) <= set(sent) | {doubled[-1]}
+    assert len(recorded) == len(set(recorded))
+    return sent, doubled, recorded
+
+
+@pytest.mark.parametrize("times", [2, pytest.param(100, marks=pytest.mark.slow)])
+def test_each_process_killed_in_turn_under_load_leaks_nothing(start, chain, tmp_path, times):
+    node = start("launch", chain(period=10, size=100_000)).up()
+    kill_in_turn(node, tmp_path, times)
+    assert node.stop() == 0
+    recorded_of_committed(tmp_path)
+    assert list((tmp_path / "run" / "node" / "links").iterdir()) == []
+    assert node.children() == []
+
+
+def test_what_a_killed_process_had_committed_is_recorded(start, chain, tmp_path):
+    """The producer is killed again and again; the recorder beside it has all that it ever committed."""
+    node = start("launch", chain(period=5)).up()
+    for number in range(1, 4):
+        seen = len(versions(tmp_path / "node-ticker"))
+        node.wait_until(lambda seen=seen: len(versions(tmp_path / "node-ticker")) > seen + 20)
+        os.kill(node.process("source")["pid"], signal.SIGKILL)
+        node.wait_for("state", number + 1, process="source", state="running")
+    assert node.stop() == 0
+    sent = versions(tmp_path / "node-ticker")
+    # A kill may come between a commit and its note in the journal: what is recorded may be more than is noted.
+    assert set(sent) <= set(versions(tmp_path / "node-doubler"))
+    assert set(sent) <= set(versions(tmp_path / "node-writer"))
+
+
+def test_a_component_that_hangs_costs_its_process_and_is_counted(start, module, launch_file):
+    ticker = module(TICKER, "ticker", topic="ticks", hang_after=5)
+    keys = {"health_timeout_s": 0.5, "back_off": {"first_s": 0.05}, "restarts": {"limit": 1}}
+    node = start("launch", launch_file(source={"modules": [ticker], **keys}))
+    assert "hangs: ticker.process at version" in node.wait_for("hangs", process="source")["reason"]
+    died = node.wait_for("died", process="source")
+    assert died["cause"] == "hung"
+    # The stacks of its threads are in its log: the line that hangs is among them.
+    log = Path(node.environment["WARPLOOM_RUN"], "node", "log", "source.log").read_text()
+    assert "launch_parts.py" in log
+    assert "in process" in log
+    assert node.wait() == 1
+    assert "1 restarts within 60 s did not help" in node.find("state", state="gave up")[0]["reason"]
+
+
+@pytest.mark.parametrize("how", ["stopped", "holding the interpreter"])
+def test_a_process_without_a_sign_of_life_is_killed(start, module, launch_file, how):
+    config = "{dies: holding the interpreter}" if how != "stopped" else "{}"
+    plain = module(PLAIN, "plain", config=config)
+    node = start("launch", launch_file(one={"modules": [plain], "health_timeout_s": 0.6, "restarts": {"limit": 1}}))
+    node.wait_for("state", state="running")
+    if how == "stopped":
+        os.kill(node.up().process("one")["pid"], signal.SIGSTOP)
+    died = node.wait_for("died", process="one")
+    assert died["cause"] == "hung"
+    assert "gave no sign of life for 0.6 s; was ended by SIGKILL" in died["reason"]
+    node.wait_for("state", 2, state="running")
+
+
+def test_a_stop_while_it_builds_ends_it_at_once(start, module, launch_file):
+    stubborn = module(PLAIN, "stubborn", config="{dies: stubborn build}")
+    node = start("launch", launch_file(one=[stubborn]))
+    node.wait_for("state", state="building")
+    time.sleep(1.0)  # into the build itself; whatever of it was reached, the end is the same
+    begin = time.monotonic()
+    assert node.stop() == 0
+    assert time.monotonic() - begin < 30  # the build takes 60 s
+    assert not node.find("state", state="running")
+
+
+def test_the_children_end_with_a_killed_supervisor_and_the_next_one_reaps(start, chain, tmp_path):
+    node = start("launch", chain()).up()
+    node.wait_until(lambda: len(versions(tmp_path / "node-writer")) > 5)
+    os.kill(node.process("source")["pid"], signal.SIGKILL)  # leaves its socket behind
+    os.kill(node.supervisor.pid, signal.SIGKILL)
+    node.supervisor.wait()
+    node.wait_until(lambda: not node.children())
+    left = sorted(path.name for path in (tmp_path / "run" / "node" / "links").iterdir())
+    assert "ticks.socket" in left
+    again = start("launch", chain()).up()
+    removed = [Path(path).name for path in again.find("reaped")[0]["removed"]]
+    assert "ticks.socket" in removed
+    count = len(versions(tmp_path / "node-writer"))
+    again.wait_until(lambda: len(versions(tmp_path / "node-writer")) > count + 5)
+    assert again.stop() == 0
+
+
+def test_two_nodes_run_side_by_side_and_one_of_a_name_alone(start, chain, tmp_path):
+    one, two = start("launch", chain("one")), start("launch", chain("two"))
+    for node, name in ((one, "one"), (two, "two")):
+        node.up()
+        node.wait_until(lambda name=name: len(versions(tmp_path / f"{name}-writer")) > 5)
+    third = start("launch", tmp_path / "one.launch.yaml")
+    assert third.wait() == 2
+    assert f"node 'one' runs already (process {one.supervisor.pid})" in third.errors
+    assert (one.stop(), two.stop()) == (0, 0)
+    assert set(versions(tmp_path / "one-writer")).isdisjoint(versions(tmp_path / "two-writer"))
+
+
+def test_a_queue_that_fills_drops_what_it_must_and_counts_it(start, module, launch_file):
+    ticker = module(TICKER, "ticker", topic="ticks", period=2)
+    slow = module(DOUBLER, "slow", sent="ticks", topic="doubled", slow_s=0.1)
+    node = start("launch", launch_file(source=[ticker], sink=[slow])).up()
+    losses = node.wait_until(lambda: node.process("sink")["losses"].get("slow", {}).get("backlog"))
+    assert losses > 0
+    ticks = next(one for one in node.ask("topics")["topics"] if one["topic"] == "ticks")
+    assert ticks["rate_hz"] > 50  # the producer does not wait
+    assert node.stop() == 0
+
+
+def test_a_process_is_what_the_launch_file_says_and_no_more(start, module, launch_file, tmp_path):
+    plain = module(PLAIN, "plain", config=f"{{path: {tmp_path / 'notes'}}}")
+    keys = {
+        "cpus": [0],
+        "nice": 7,
+        "environment": {"WARPLOOM_TEST": 5},
+        "process_name": "compute3d_scheduler",
+        "cgroup": "warploom-test/one",
+    }
+    other = {"modules": [module(PLAIN, "other")], "cpus": [1000], "nice": -20}
+    node = start("launch", launch_file(one={"modules": [plain], **keys}, two=other)).up()
+    pid = node.process("one")["pid"]
+    child = psutil.Process(pid)
+    assert child.cpu_affinity() == [0]
+    assert child.nice() == 7
+    assert child.environ()["WARPLOOM_TEST"] == "5"
+    assert Path(f"/proc/{pid}/comm").read_text().strip() == "compute3d_sched"  # 15 bytes, as the system has it
+    joined = "warploom-test/one" in Path(f"/proc/{pid}/cgroup").read_text()
+    warned = any("cgroup warploom-test/one" in event["message"] for event in node.find("warning"))
+    assert joined != warned
+    # What is not permitted, or not there, is a warning; the process runs.
+    assert any("cpus [1000]: " in message for message in node.process("two")["warnings"])
+    # A process without perception does not load what perception needs.
+    maps = Path(f"/proc/{pid}/maps").read_text()
+    assert not [library for library in ("warp", "onnxruntime", "cv2", "torch") if f"/{library}/" in maps]
+    node.ask("restart", process="one")
+    node.wait_for("state", 2, process="one", state="running")
+    assert node.process("one")["deaths"] == {"restarted": 1}
+    node.signal(signal.SIGINT)
+    assert node.wait() == 0
+    notes = [line.split()[0] for line in (tmp_path / "notes").read_text().splitlines()]
+    assert notes == ["start", "stop", "start", "stop"]
+    assert not any(Path("/sys/fs/cgroup").glob("**/warploom-test"))
