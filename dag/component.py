@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Container, Mapping, Sequence
 from functools import partial
@@ -25,6 +24,7 @@ from ..datamesh import (
 from .backlog import Backlog, BacklogConfig
 from .deadline import DeadlineConfig, FrameDeadline
 from .engine import GraphEngine, Run, Vertex, VertexTiming
+from .logs import component_logger
 from .processor import ProcessorConfig
 from .trigger import Trigger, TriggerConfig
 from .triggering import AllTrigger, AnyTrigger, TimeTrigger, TriggerSource
@@ -36,8 +36,6 @@ __all__ = [
     "GenericComponent",
     "MonotonicDagComponent",
 ]
-
-_log = logging.getLogger(__name__)
 
 
 class Component:
@@ -60,6 +58,8 @@ class Component:
         for handle_name, handle in declared_handles(type(self)).items():
             (self.inputs if isinstance(handle, Input) else self.outputs)[handle_name] = handle  # type: ignore[assignment]
             setattr(self, handle_name, handle)
+        self.log = component_logger(name)
+        """Its own: `warploom.component.NAME`."""
         self.losses = LossCounters()
         self.clock: Clock = SystemClock()
         self.flags: Mapping[str, Any] = {}
@@ -293,7 +293,7 @@ class DataProcessComponent(Component):
 
     def _hangs(self, where: Mapping[str, int]) -> None:
         for part, version in where.items():
-            _log.error("%s: %s hangs at version %d since the stop, and is left to itself", self.name, part, version)
+            self.log.error("%s: %s hangs at version %d since the stop, and is left to itself", self.name, part, version)
             self.losses.count(self.name, "hung", version)
 
     def _drop_waiting(self) -> None:
@@ -330,7 +330,7 @@ class DataProcessComponent(Component):
         try:
             self.process(trigger)
         except BaseException:  # also SystemExit: only the process as a whole may end the thread
-            _log.exception("%s failed at version %d", self.name, trigger.version)
+            self.log.exception("%s failed at version %d", self.name, trigger.version)
             self.losses.count(self.name, "failed", trigger.version)
         self.settle(trigger.version, trigger.epoch)
         self._running = None
@@ -428,7 +428,7 @@ class DagComponent(DataProcessComponent):
                 try:
                     vertex.processor.close()
                 except Exception:
-                    _log.exception("%s.%s failed to close", self.name, vertex.name)
+                    self.log.exception("%s.%s failed to close", self.name, vertex.name)
         self._closed = True
 
     def _is_busy(self) -> bool:
@@ -452,7 +452,7 @@ class DagComponent(DataProcessComponent):
                 try:
                     self._submit(trigger, serves)
                 except Exception:
-                    _log.exception("%s could not start at version %d", self.name, trigger.version)
+                    self.log.exception("%s could not start at version %d", self.name, trigger.version)
                     self.losses.count(self.name, "failed", trigger.version)
                     self.settle(trigger.version, trigger.epoch)
         if self._stopping:

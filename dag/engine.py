@@ -7,7 +7,6 @@ depend on how many workers there are. A vertex that waits for data of the mesh g
 
 from __future__ import annotations
 
-import logging
 import queue
 import threading
 import time
@@ -19,13 +18,12 @@ from typing import Any, NamedTuple
 
 from ..datamesh import Status
 from .deadline import FrameDeadline
+from .logs import component_logger
 from .processor import Processor, Wiring
 from .recorded_reads import Read
 from .trigger import Trigger
 
 __all__ = ["GraphEngine", "Run", "Vertex", "VertexTiming"]
-
-_log = logging.getLogger(__name__)
 
 
 class VertexTiming(NamedTuple):
@@ -305,7 +303,7 @@ class GraphEngine:
         try:
             callback(event)
         except Exception:
-            _log.exception("%s: a callback failed", self.name)
+            component_logger(self.name).exception("%s: a callback failed", self.name)
 
     def _execute(self, vertex: Vertex, run: Run, resumed: bool) -> bool:
         """Runs a vertex for a frame; False where it waits, and goes on later."""
@@ -329,7 +327,8 @@ class GraphEngine:
             except BaseException as error:  # also SystemExit: only the process as a whole may end a worker
                 status = Status.FAILED
                 run.error, run.failed_vertex = error, vertex.name
-                _log.exception("%s.%s failed at version %d", self.name, vertex.name, run.trigger.version)
+                log = component_logger(f"{self.name}.{vertex.name}")
+                log.exception("%s.%s failed at version %d", self.name, vertex.name, run.trigger.version)
         wiring.clear()
         reads = processor.reads
         if reads:

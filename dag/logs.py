@@ -24,7 +24,7 @@ _NAME = "warploom"  # of our handlers
 
 
 def component_logger(name: str) -> logging.Logger:
-    """The logger of a component: `warploom.component.NAME`."""
+    """The logger of a component: `warploom.component.NAME`; that of a vertex, `component.vertex`, lies below it."""
     return logging.getLogger(f"warploom.component.{name}")
 
 

@@ -11,13 +11,16 @@ class NearestObject(Processor):
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ConfigDict
 
 from ..datamesh import Input, LossCounters, Output, Status
+from .logs import component_logger
 from .recorded_reads import Read, RecordedReads
 from .trigger import Trigger
 
@@ -125,6 +128,11 @@ class Processor:
         self.ports = declared_ports(type(self))
         for name, port in self.ports.items():
             setattr(self, name, port)
+
+    @cached_property
+    def log(self) -> logging.Logger:
+        """Its logger, from `init` on: `warploom.component.COMPONENT.VERTEX`."""
+        return component_logger(self.place)
 
     def check(self, config: Any) -> None:
         """Says what in a configuration does not fit its surroundings; compiles and loads nothing. Called before `init`.

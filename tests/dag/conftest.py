@@ -93,3 +93,18 @@ def no_thread_left():
     yield
     left = set(threading.enumerate()) - before
     assert not left, f"threads left: {left}"
+
+
+@pytest.fixture
+def started():
+    """Starts components, and stops them at the end in the order in which they are given."""
+    components = []
+
+    def start(*new):
+        components.extend(new)
+        for component in reversed(new):
+            component.start()
+
+    yield start
+    for component in components:
+        component.stop()

@@ -206,6 +206,7 @@ def test_one_exception_costs_one_frame(caplog):
         "last": Status.SKIPPED,
     }
     assert "graph.fails failed at version 2" in caplog.text
+    assert [one.name for one in caplog.records] == ["warploom.component.graph.fails"]
 
 
 @pytest.mark.parametrize("wrong", [None, True, "ok", 0])
@@ -430,6 +431,33 @@ def test_a_slow_vertex_makes_its_frames_wait_and_drops_none():
     assert all(run.data["fast"] == 1 for run in done.values())
     waits = [t.wait_ms for t in timings if t.vertex == "slow"]
     assert waits == sorted(waits), "each waits for all before it"
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_worker_that_is_roused_for_nothing_sleeps_again_and_misses_nothing(workers):
+    with Frames([vertex("a", ones, "input"), vertex("b", ones, "a")], workers) as frames:
+        for version in range(200):
+            for _ in range(version % 4):
+                frames.engine.rouse()
+            frames.submit(version, input=version)
+            if version % 10 == 0:
+                frames.wait()
+        frames.wait()
+        assert sorted(frames.done) == list(range(200))
+
+
+def test_what_is_left_out_of_a_frame_is_cut_in_it_alone():
+    timings = []
+    left_out = vertex("left_out", ones, "input")
+    left_out.left_out = {(-1, 2)}
+    with Frames([left_out, vertex("after", ones, "left_out")], 1, timings.append) as frames:
+        for version in (1, 2, 3):
+            frames.submit(version, input=0)
+        frames.wait()
+    statuses = {(one.vertex, one.version): one.status for one in timings}
+    assert statuses["left_out", 2] is Status.CUT
+    assert statuses["after", 2] is Status.SKIPPED
+    assert {statuses[name, version] for name in ("left_out", "after") for version in (1, 3)} == {Status.OK}
 
 
 def test_whoever_serves_the_graph_runs_it_without_a_worker():

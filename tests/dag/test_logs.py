@@ -4,7 +4,9 @@ import logging
 
 import pytest
 
+from warploom.dag import DataProcessComponent, In, Process, Processor, Status, load_module
 from warploom.dag.logs import RepeatLimit, component_logger, start_logging, stop_logging
+from warploom.datamesh import Input
 from warploom.errors import ConfigError
 
 
@@ -104,3 +106,47 @@ def test_bad_arguments_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="the log cannot be written"):
         start_logging("info", tmp_path / "file" / "below")
+
+
+class Says(Processor):
+    value: In[int]
+
+    def process(self, trigger):
+        self.log.warning("value %d", self.value.value)
+        return Status.OK
+
+
+class SaysToo(DataProcessComponent):
+    value: Input[int]
+
+    def process(self, trigger):
+        self.log.warning("version %d", trigger.version)
+        return Status.OK
+
+
+def test_each_component_and_vertex_has_a_logger_of_its_name(write, topic, caplog):
+    text = f"""\
+module: says
+components:
+  - name: graph
+    kind: dag
+    trigger: value
+    inputs: {{value: sensor/value}}
+    hand_off: inline
+    graph:
+      first: {{processor: {__name__}.Says}}
+  - name: plain
+    class: {__name__}.SaysToo
+    kind: data
+    trigger: value
+    inputs: {{value: sensor/value}}
+    hand_off: inline
+"""
+    process = Process([load_module(write(text))], external={"sensor/value": int})
+    process.start()
+    topic(process.mesh.window("sensor/value")).commit(5, 7)
+    process.stop()
+    assert sorted((one.name, one.getMessage()) for one in caplog.records) == [
+        ("warploom.component.graph.first", "value 7"),
+        ("warploom.component.plain", "version 5"),
+    ]
