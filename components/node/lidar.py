@@ -126,15 +126,16 @@ class LidarDriver(Component):
         try:
             self._phase = "making frames"
             frames = self._frames()
-            first = next(frames, None)
+            frame = next(frames, None)
             self._phase = "playing"
             due = self.clock.monotonic_ns()
             index = 0
-            while first is not None and not self._stopping.is_set():
-                self._commit(replace(first, version=self.clock.now_ns(), index=index, frame_id=self._config.sensor))
+            while frame is not None and not self._stopping.is_set():
+                self._commit(replace(frame, version=self.clock.now_ns(), index=index, frame_id=self._config.sensor))
                 index += 1
-                first = next(frames, None)
-                due = self._wait(due + self._period_ns)
+                frame = next(frames, None)
+                if frame is not None:
+                    due = self._wait(due + self._period_ns)
             self._phase = "ended"
         except WarploomError as error:
             self._failure = str(error)

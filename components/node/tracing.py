@@ -48,6 +48,7 @@ class TraceWriter(Component):
         self._config = TraceWriterConfig()
         self._trace: Trace | None = None
         self._timer: Timer | None = None
+        self._ending: threading.Thread | None = None
         self._failure: str | None = None
         self._done = False
 
@@ -98,7 +99,8 @@ class TraceWriter(Component):
 
     def _is_over(self) -> None:
         # Writing takes a while, and the clock has other calls to make.
-        threading.Thread(target=self._end, name=f"{self.name}-end", daemon=True).start()
+        self._ending = threading.Thread(target=self._end, name=f"{self.name}-end", daemon=True)
+        self._ending.start()
 
     def _end(self) -> None:
         trace = self._trace
@@ -113,6 +115,8 @@ class TraceWriter(Component):
         """Writes the trace to its end."""
         if self._timer is not None:
             self._timer.cancel()
+        if self._ending is not None:
+            self._ending.join()
         self._end()
 
     @property
