@@ -5,20 +5,16 @@ from __future__ import annotations
 import warp as wp
 
 from .track_motion import (
-    CONSTANT_VELOCITY,
-    STRAIGHT,
-    TURNING,
-    Mat4,
-    Mat5,
     Noise,
     Vec5,
-    cartesian,
     correct_place,
     correct_velocity,
-    difference,
+    covariance_between,
+    gradient_of_velocity,
     mix,
     posterior,
     predict,
+    turn_round,
     velocity_of,
     wrapped,
 )
@@ -79,10 +75,10 @@ from .track_table import (
     Frame,
     box_of,
     combine,
-    covariance_of,
-    keep,
+    filter_at,
     likeliest,
-    state_of,
+    models_of,
+    motion_of,
 )
 
 __all__ = ["begin_track", "correct_track", "predict_track", "tell", "use_detection"]
@@ -99,24 +95,15 @@ def predict_track(i: int, frame: Frame, f: wp.array2d(dtype=wp.float64), whole: 
     noise.slip = frame.parameters[kind, SLIP]
     noise.yaw = frame.parameters[kind, YAW_DRIFT]
     noise.turn = frame.parameters[kind, RATE_DRIFT]
-    s = state_of(f, i, 0)
-    p = covariance_of(f, i, 0)
     if motion == 2:
-        b = state_of(f, i, 1)
-        pb = covariance_of(f, i, 1)
         switch = HALF * (wp.float64(1.0) - wp.exp(-wp.float64(2.0) * frame.parameters[kind, SWITCH] * dt))
-        s, p, b, pb, turns = mix(s, p, b, pb, f[i, TURNS], switch)
-        s, p = predict(s, p, STRAIGHT, noise, dt)
-        b, pb = predict(b, pb, TURNING, noise, dt)
-        f[i, TURNS] = turns
-        keep(f, i, 1, b, pb)
-    else:
-        s, p = predict(s, p, wp.where(motion == 0, CONSTANT_VELOCITY, TURNING), noise, dt)
-    keep(f, i, 0, s, p)
+        f[i, TURNS] = mix(f, i, filter_at(0), filter_at(1), f[i, TURNS], switch)
+    for model in range(models_of(motion)):
+        predict(f, i, filter_at(model), motion_of(motion, model), noise, dt)
     f[i, VARIANCE] = f[i, VARIANCE] + dt * frame.parameters[kind, VERTICAL]
     for k in range(1, 4):
         f[i, VARIANCE + k] = f[i, VARIANCE + k] + dt * frame.parameters[kind, SIZE_DRIFT]
-    combine(f, i, motion, True)
+    combine(f, i, motion)
 
 
 @wp.func
@@ -169,28 +156,8 @@ def use_detection(j: int, frame: Frame):
 
 
 @wp.func
-def _turned_round(s: Vec5, motion: int) -> Vec5:
-    """A state with the opposite heading, moving as before."""
-    s[2] = s[2] + wp.float64(wp.PI)
-    if motion != 0:
-        s[3] = -s[3]
-    return s
-
-
-@wp.func
-def _turn_covariance(p: Mat5, motion: int) -> Mat5:
-    if motion != 0:
-        for k in range(5):
-            if k != 3:
-                p[3, k] = -p[3, k]
-                p[k, 3] = -p[k, 3]
-    return p
-
-
-@wp.func
 def _take_box(frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, kind: int, motion: int, box: Vec7, outvoted: bool):
     """Corrects a track by the box that was measured, at the heading that was made out for it."""
-    yaw = box[6]
     place = frame.parameters[kind, POSITION]
     turn = frame.parameters[kind, TURN]
     for k in range(4):
@@ -200,15 +167,11 @@ def _take_box(frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, kind: int, 
         f[i, 2 + k] = f[i, 2 + k] + gain * (box[2 + k] - f[i, 2 + k])
         f[i, VARIANCE + k] = p - gain * p
     likely = wp.vec2d()
-    for model in range(wp.where(motion == 2, 2, 1)):
-        s = state_of(f, i, model)
-        p5 = covariance_of(f, i, model)
+    for model in range(models_of(motion)):
+        at = filter_at(model)
         if outvoted:
-            s = _turned_round(s, motion)
-            p5 = _turn_covariance(p5, motion)
-        s, p5, fit = correct_place(s, p5, box[0], box[1], yaw, place, turn)
-        likely[model] = fit
-        keep(f, i, model, s, p5)
+            turn_round(f, i, at, motion_of(motion, model))
+        likely[model] = correct_place(f, i, at, box[0], box[1], box[6], place, turn)
     if motion == 2:
         f[i, TURNS] = posterior(f[i, TURNS], likely[0], likely[1])
 
@@ -223,28 +186,23 @@ def _take_velocity(frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, kind: 
     if not has_velocity and not has_radial:
         return
     likely = wp.vec2d()
-    moves = wp.where(motion == 0, CONSTANT_VELOCITY, TURNING)
-    for model in range(wp.where(motion == 2, 2, 1)):
-        s = state_of(f, i, model)
-        p = covariance_of(f, i, model)
+    for model in range(models_of(motion)):
         total = wp.float64(0.0)
-        if has_velocity:
+        # Along x, along y, along the line of sight: what of these was measured.
+        for k in range(3):
+            x = wp.float64(wp.where(k == 0, 1.0, 0.0))
+            y = wp.float64(wp.where(k == 1, 1.0, 0.0))
+            speed = frame.used[j, Z_VX + wp.min(k, 1)]
             variance = frame.parameters[kind, VELOCITY]
-            one = wp.float64(1.0)
-            none = wp.float64(0.0)
-            s, p, fit = correct_velocity(s, p, moves, one, none, frame.used[j, Z_VX], variance)
-            total += fit
-            s, p, fit = correct_velocity(s, p, moves, none, one, frame.used[j, Z_VX + 1], variance)
-            total += fit
-        if has_radial:
-            std = frame.used[j, Z_RADIAL + 3]
-            s, p, fit = correct_velocity(
-                s, p, moves, frame.used[j, Z_RADIAL], frame.used[j, Z_RADIAL + 1], frame.used[j, Z_RADIAL + 2],
-                std * std,
-            )  # fmt: skip
-            total += fit
+            if k == 2:
+                x = frame.used[j, Z_RADIAL]
+                y = frame.used[j, Z_RADIAL + 1]
+                speed = frame.used[j, Z_RADIAL + 2]
+                variance = frame.used[j, Z_RADIAL + 3] * frame.used[j, Z_RADIAL + 3]
+            if (k < 2 and has_velocity) or (k == 2 and has_radial):
+                moves = motion_of(motion, model)
+                total += correct_velocity(f, i, filter_at(model), moves, x, y, speed, variance)
         likely[model] = total
-        keep(f, i, model, s, p)
     if motion == 2:
         f[i, TURNS] = posterior(f[i, TURNS], likely[0], likely[1])
 
@@ -306,32 +264,70 @@ def begin_track(frame: Frame, f: wp.array2d(dtype=wp.float64), whole: wp.array2d
     f[i, VARIANCE] = place
     for k in range(1, 4):
         f[i, VARIANCE + k] = frame.parameters[kind, SIZE]
-    s = Vec5()
-    s[0] = f[i, 0]
-    s[1] = f[i, 1]
-    s[2] = f[i, YAW]
-    p = Mat5()
-    p[0, 0] = place
-    p[1, 1] = place
-    p[2, 2] = frame.parameters[kind, TURN]
-    p[3, 3] = frame.parameters[kind, SPEED]
-    p[4, 4] = frame.parameters[kind, wp.where(motion == 0, SPEED, RATE)]
-    keep(f, i, 0, s, p)
-    if motion == 2:
-        keep(f, i, 1, s, p)
-        f[i, TURNS] = TURNS_AT_FIRST
+    for model in range(models_of(motion)):
+        at = filter_at(model)
+        f[i, at] = f[i, 0]
+        f[i, at + 1] = f[i, 1]
+        f[i, at + 2] = f[i, YAW]
+        f[i, at + 5] = place
+        f[i, at + 11] = place
+        f[i, at + 17] = frame.parameters[kind, TURN]
+        f[i, at + 23] = frame.parameters[kind, SPEED]
+        f[i, at + 29] = frame.parameters[kind, wp.where(motion == 0, SPEED, RATE)]
+    f[i, TURNS] = TURNS_AT_FIRST
     score = frame.used[j, Z_SCORE]
     f[i, SCORE] = score
     f[i, VOTES] = wp.float64(1.0)
     f[i, EVIDENCE + frame.given_whole[j, 0]] = wp.max(score, LEAST_SCORE)
     _take_velocity(frame, f, i, kind, motion, j)
-    combine(f, i, motion, False)
+    combine(f, i, motion)
     whole[i, KIND] = wp.int64(kind)
     whole[i, MOVES] = wp.int64(motion)
     whole[i, SEEN] = frame.whole[NOW]
     whole[i, HITS] = wp.int64(1)
     whole[i, AGE] = wp.int64(1)
     whole[i, CONFIRMED] = wp.int64(wp.where(frame.birth_report[j] >= 0, 1, 0))
+
+
+@wp.func
+def _told_gradient(frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, of: int, moves: int, k: int) -> Vec5:
+    """Of x, y and the velocity along x and y in the frame of the detections by the state of a filter."""
+    x = frame.real[POSE + (k & 1)]
+    y = frame.real[POSE + 4 + (k & 1)]
+    if k < 2:
+        h = Vec5()
+        h[0] = x
+        h[1] = y
+        return h
+    return gradient_of_velocity(f, i, of, moves, x, y)
+
+
+@wp.func
+def _told_offset(frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, of: int, moves: int, k: int) -> wp.float64:
+    """How far a filter's own x, y and velocity are from the track's, in the frame of the detections."""
+    x = f[i, of] - f[i, 0]
+    y = f[i, of + 1] - f[i, 1]
+    if k > 1:
+        v = velocity_of(f, i, of, moves)
+        x = v[0] - f[i, VX]
+        y = v[1] - f[i, VX + 1]
+    return frame.real[POSE + (k & 1)] * x + frame.real[POSE + 4 + (k & 1)] * y
+
+
+@wp.func
+def _tell_covariance(
+    frame: Frame, f: wp.array2d(dtype=wp.float64), i: int, at: int, of: int, moves: int, share: wp.float64
+):
+    """Adds a filter's share to the covariance of place and velocity in the report."""
+    for row in range(4):
+        a = _told_gradient(frame, f, i, of, moves, row)
+        off = _told_offset(frame, f, i, of, moves, row)
+        for column in range(4):
+            b = _told_gradient(frame, f, i, of, moves, column)
+            value = covariance_between(f, i, of, a, b)
+            value += off * _told_offset(frame, f, i, of, moves, column)
+            to = R_COVARIANCE + 4 * row + column
+            frame.report[at, to] = frame.report[at, to] + share * value
 
 
 @wp.func
@@ -357,29 +353,13 @@ def tell(
     frame.report[at, 8] = r01 * f[i, VX] + r11 * f[i, VX + 1]
     frame.report[at, 9] = f[i, RATE_OF]
     motion = int(whole[i, MOVES])
-    s = state_of(f, i, 0)
-    covariance = cartesian(s, covariance_of(f, i, 0), wp.where(motion == 0, CONSTANT_VELOCITY, TURNING))
-    if motion == 2:
-        share = f[i, TURNS]
-        rest = wp.float64(1.0) - share
-        b = state_of(f, i, 1)
-        v = velocity_of(s, TURNING)
-        w = velocity_of(b, TURNING)
-        d = difference(b, s)
-        apart = wp.vec4d(d[0], d[1], w[0] - v[0], w[1] - v[1])
-        covariance = covariance * rest + cartesian(b, covariance_of(f, i, 1), TURNING) * share
-        covariance = covariance + wp.outer(apart, apart) * (share * rest)
-    # Place and velocity turn likewise.
-    turn = Mat4(
-        r00, r10, wp.float64(0.0), wp.float64(0.0),
-        r01, r11, wp.float64(0.0), wp.float64(0.0),
-        wp.float64(0.0), wp.float64(0.0), r00, r10,
-        wp.float64(0.0), wp.float64(0.0), r01, r11,
-    )  # fmt: skip
-    turned = turn * covariance * wp.transpose(turn)
-    for a in range(4):
-        for b in range(4):
-            frame.report[at, R_COVARIANCE + 4 * a + b] = turned[a, b]
+    for k in range(16):
+        frame.report[at, R_COVARIANCE + k] = wp.float64(0.0)
+    for model in range(models_of(motion)):
+        share = wp.float64(1.0)
+        if motion == 2:
+            share = wp.where(model == 0, wp.float64(1.0) - f[i, TURNS], f[i, TURNS])
+        _tell_covariance(frame, f, i, at, filter_at(model), motion_of(motion, model), share)
     unseen = detection < 0
     frame.report[at, R_SCORE] = f[i, SCORE] * wp.where(unseen, frame.real[COASTED], wp.float64(1.0))
     frame.report_whole[at, 0] = whole[i, ID]

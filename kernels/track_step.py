@@ -69,7 +69,7 @@ from .track_table import (
 
 __all__ = ["TrackStep"]
 
-wp.set_module_options({"fuse_fp": False})
+wp.set_module_options({"fuse_fp": False, "max_unroll": 1})
 
 
 @wp.kernel
@@ -295,7 +295,7 @@ def _write(
         detection = search.of_track[i]
         if detection >= 0:
             correct_track(frame, real_out, whole_out, to, detection, motion)
-            combine(real_out, to, motion, False)
+            combine(real_out, to, motion)
         if frame.track_report[i] >= 0:
             tell(frame, real_out, whole_out, to, frame.track_report[i], detection)
     if i < int(frame.whole[DETECTIONS]) and frame.birth_place[i] >= 0:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from . import device  # noqa: F401  (starts Warp quietly)
-from .track_motion import CONSTANT_VELOCITY, TURNING, Mat5, Vec5, mean_of, spread_of, velocity_of
+from .track_motion import CONSTANT_VELOCITY, STRAIGHT, TURNING, velocity_of, wrapped
 from .track_overlap import Vec7
 
 __all__ = [
@@ -103,10 +103,10 @@ __all__ = [
     "S",
     "box_of",
     "combine",
-    "covariance_of",
-    "keep",
+    "filter_at",
     "likeliest",
-    "state_of",
+    "models_of",
+    "motion_of",
 ]  # fmt: skip
 
 MOTIONS = ("cv", "ctrv", "imm")
@@ -185,66 +185,59 @@ class Frame:
 
 
 @wp.func
-def state_of(f: wp.array2d(dtype=wp.float64), i: int, model: int) -> Vec5:
-    """The state of one of a track's filters."""
-    s = Vec5()
-    for k in range(5):
-        s[k] = f[i, S + model * FILTER + k]
-    return s
+def filter_at(model: int) -> int:
+    """Where one of a track's filters begins."""
+    return S + model * FILTER
 
 
 @wp.func
-def covariance_of(f: wp.array2d(dtype=wp.float64), i: int, model: int) -> Mat5:
-    """The covariance of one of a track's filters."""
-    p = Mat5()
-    at = P + model * FILTER
-    for a in range(5):
-        for b in range(5):
-            p[a, b] = f[i, at + 5 * a + b]
-    return p
+def motion_of(motion: int, model: int) -> int:
+    """How one of a track's filters moves."""
+    if motion == 0:
+        return CONSTANT_VELOCITY
+    if motion == 2 and model == 0:
+        return STRAIGHT
+    return TURNING
 
 
 @wp.func
-def keep(f: wp.array2d(dtype=wp.float64), i: int, model: int, s: Vec5, p: Mat5):
-    """Writes state and covariance of one of a track's filters."""
-    at = S + model * FILTER
-    for a in range(5):
-        f[i, at + a] = s[a]
-        for b in range(5):
-            f[i, at + 5 + 5 * a + b] = p[a, b]
+def models_of(motion: int) -> int:
+    """How many filters a track has."""
+    return wp.where(motion == 2, 2, 1)
 
 
 @wp.func
-def combine(f: wp.array2d(dtype=wp.float64), i: int, motion: int, place: bool):
-    """Box and rates of a track from its filter or filters, and before association the variances of the place."""
-    s = state_of(f, i, 0)
-    x = Vec5(s[0], s[1], s[2], s[3], s[4])
-    v = velocity_of(s, wp.where(motion == 0, CONSTANT_VELOCITY, TURNING))
+def combine(f: wp.array2d(dtype=wp.float64), i: int, motion: int):
+    """Writes place, heading, rates and the variances of the place of a track, as its filter or filters have them."""
+    at = filter_at(0)
+    v = velocity_of(f, i, at, motion_of(motion, 0))
+    x = f[i, at]
+    y = f[i, at + 1]
+    yaw = f[i, at + 2]
     rate = wp.float64(0.0)
-    at = P
-    vx = v[0]
-    vy = v[1]
-    pxx = f[i, at]
-    pyy = f[i, at + 6]
+    pxx = f[i, at + 5]
+    pyy = f[i, at + 11]
     if motion == 1:
-        rate = s[4]
+        rate = f[i, at + 4]
     if motion == 2:
-        b = state_of(f, i, 1)
+        other = filter_at(1)
+        w = velocity_of(f, i, other, TURNING)
         share = f[i, TURNS]
-        x = mean_of(s, b, share)
-        w = velocity_of(b, TURNING)
-        vx = v[0] + share * (w[0] - v[0])
-        vy = v[1] + share * (w[1] - v[1])
-        rate = share * b[4]
-        if place:
-            p = spread_of(s, covariance_of(f, i, 0), b, covariance_of(f, i, 1), share)
-            pxx = p[0, 0]
-            pyy = p[1, 1]
-    f[i, 0] = x[0]
-    f[i, 1] = x[1]
-    f[i, YAW] = x[2]
-    f[i, VX] = vx
-    f[i, VX + 1] = vy
+        apart = share * (wp.float64(1.0) - share)
+        dx = f[i, other] - x
+        dy = f[i, other + 1] - y
+        pxx = pxx + share * (f[i, other + 5] - pxx) + apart * dx * dx
+        pyy = pyy + share * (f[i, other + 11] - pyy) + apart * dy * dy
+        x = x + share * dx
+        y = y + share * dy
+        yaw = wrapped(yaw + share * wrapped(f[i, other + 2] - yaw))
+        v = v + (w - v) * share
+        rate = share * f[i, other + 4]
+    f[i, 0] = x
+    f[i, 1] = y
+    f[i, YAW] = yaw
+    f[i, VX] = v[0]
+    f[i, VX + 1] = v[1]
     f[i, RATE_OF] = rate
     f[i, PLACE] = pxx
     f[i, PLACE + 1] = pyy
