@@ -144,7 +144,7 @@ def ps(node: Node = None, as_json: AsJson = False) -> None:
     Example: `warploom ps --node computing_node_hw50_pandar90_13_600`
     """
     from ..dag.launch.control import connect
-    from ..dag.launch.table import process_table
+    from ..dag.launch.table import component_table, process_table
 
     _, client = connect(node)
     with client:
@@ -153,6 +153,7 @@ def ps(node: Node = None, as_json: AsJson = False) -> None:
         typer.echo(json.dumps(status))
     else:
         _print(process_table(status))
+        _print(component_table(status))
 
 
 @commands.command()
@@ -183,7 +184,7 @@ def top(
                 continue
             if sys.stdout.isatty():
                 typer.clear()
-            _print(process_table(status, cpu, wide=False))
+            _print(process_table(status, cpu))
             typer.echo(f"supervisor: process {status['supervisor']['pid']}, {cpu[status['supervisor']['pid']]:.1f} %")
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from .supervisor import Supervisor
 
-__all__ = ["JsonLines", "LiveTable", "process_table", "topic_table"]
+__all__ = ["JsonLines", "LiveTable", "component_table", "process_table", "topic_table"]
 
 _SHOWN_EVENTS = 8
 _QUIET = ("state",)
@@ -89,13 +89,12 @@ def _style(event: Mapping[str, Any]) -> str:
     return {"died": "red", "hangs": "red", "warning": "yellow", "up": "green", "ending": "bold"}.get(event["event"], "")
 
 
-def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None, *, wide: bool = True) -> Table:
+def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None) -> Table:
     """The processes of a node.
 
     Args:
         status: As `ps` is answered.
         cpu: Share of a core by process id, where it was measured [%].
-        wide: With what the components say of themselves.
     """
     from rich.table import Table
 
@@ -104,14 +103,11 @@ def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = N
         table.add_column(name, justify="left" if name in ("process", "state") else "right", no_wrap=True)
     table.add_column("says", overflow="fold")
     for process in status["processes"]:
-        says = [*process["warnings"]]
+        idle = sum(bool(component["idle_because"]) for component in process["components"])
+        says = [f"{len(process['components'])} components" + (f", {idle} of them idle" if idle else "")]
+        says += process["warnings"]
         if process["last_death"]:
             says.append(f"last death: {process['last_death']}")
-        for component in process["components"] if wide else ():
-            if component["idle_because"]:
-                says.append(f"{component['name']} is idle: {component['idle_because']}")
-            elif component["state"]:
-                says.append(f"{component['name']}: " + ", ".join(f"{k} {v}" for k, v in component["state"].items()))
         table.add_row(
             process["name"],
             process["state"],
@@ -124,6 +120,24 @@ def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = N
             "\n".join(says),
             style="" if process["state"] == "running" else "yellow",
         )
+    return table
+
+
+def component_table(status: Mapping[str, Any]) -> Table:
+    """What the components of a node say of themselves: that they are idle and why, or what they do."""
+    from rich.table import Table
+
+    table = Table(title="components", title_justify="left")
+    for name in ("process", "component", "kind", "says"):
+        table.add_column(name, overflow="fold")
+    for process in status["processes"]:
+        for component in process["components"]:
+            says = [f"{key} {value}" for key, value in component["state"].items()]
+            if component["idle_because"]:
+                says.insert(0, f"idle: {component['idle_because']}")
+            says += [f"lost {count} ({reason})" for reason, count in component["losses"].items()]
+            style = "dim" if component["idle_because"] else ""
+            table.add_row(process["name"], component["name"], str(component["kind"]), ", ".join(says), style=style)
     return table
 
 

@@ -1,0 +1,96 @@
+"""How the state of a node is shown."""
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from warploom.dag.launch.table import JsonLines, component_table, duration_text, event_text, process_table, topic_table
+
+STATUS = {
+    "node": "two",
+    "processes": [
+        {
+            "name": "compute",
+            "state": "running",
+            "pid": 41,
+            "uptime_s": 3725.0,
+            "restarts": 2,
+            "rss": 3 * 2**20,
+            "fds": 9,
+            "warnings": ["nice -5: not permitted"],
+            "last_death": "was ended by SIGKILL",
+            "components": [
+                {"name": "gnss", "kind": "generic X", "idle_because": "no receiver", "state": {}, "losses": {}},
+                {
+                    "name": "lidar",
+                    "kind": "Dag",
+                    "idle_because": None,
+                    "state": {"hz": 10},
+                    "losses": {"backlog": 4},
+                },
+            ],
+        },
+        {
+            "name": "gone",
+            "state": "back off",
+            "pid": None,
+            "uptime_s": None,
+            "restarts": 0,
+            "warnings": [],
+            "last_death": "",
+            "components": [],
+        },
+    ],
+}
+
+
+def text(table):
+    out = io.StringIO()
+    Console(file=out, width=200).print(table)
+    return out.getvalue()
+
+
+def test_processes_are_shown_with_what_they_say():
+    shown = text(process_table(STATUS, {41: 12.34}))
+    for expected in ("compute", "running", "41", "1:02:05", "12.3", "3 MiB", "2 components, 1 of them idle", "nice -5"):
+        assert expected in shown
+    assert "last death: was ended by SIGKILL" in shown
+    assert "back off" in shown
+
+
+def test_components_say_why_they_are_idle_or_what_they_do():
+    shown = text(component_table(STATUS))
+    assert "idle: no receiver" in shown
+    assert "hz 10, lost 4 (backlog)" in shown
+
+
+def test_topics_are_shown():
+    topics = [
+        {"topic": "a", "producer": "p/c", "readers": ["q/d"], "type": "int", "commits": 7, "rate_hz": 9.96},
+        {"topic": "b", "producer": None, "readers": []},
+    ]
+    shown = text(topic_table({"topics": topics}))
+    assert "10.0" in shown
+    assert "nobody" in shown
+
+
+@pytest.mark.parametrize(("seconds", "expected"), [(None, "-"), (3.21, "3.2 s"), (60, "0:01:00"), (90061, "25:01:01")])
+def test_durations(seconds, expected):
+    assert duration_text(seconds) == expected
+
+
+def test_an_event_is_a_line_to_read_or_of_json():
+    event = {"event": "died", "process": "p", "time": 0, "node": "n", "reason": "was ended", "last_lines": ["oops"]}
+    assert "p died: reason was ended\n           | oops" in event_text(event)
+    out = io.StringIO()
+    JsonLines(out)(event)
+    assert json.loads(out.getvalue()) == event
+
+
+def test_a_reader_that_is_gone_does_not_break_the_supervisor():
+    out = io.StringIO()
+    lines = JsonLines(out)
+    out.close()
+    lines({"event": "up"})
