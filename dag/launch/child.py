@@ -184,7 +184,7 @@ class Child:
                 links.stop()
             return 1
         self._links = links
-        self._channel.send({"report": "running"})
+        self._channel.send({"report": "running", **observer.beat()})
         beats = threading.Thread(
             target=self._beat, args=(observer, beat_period(self._spec.health_timeout_s)), daemon=True
         )

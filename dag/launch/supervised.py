@@ -292,9 +292,9 @@ class SupervisedProcess:
     async def _take_report(self, life: _Life, report: dict[str, Any]) -> bool:
         """Takes what the process said; True where it began to run with it."""
         kind = report.get("report")
-        if kind == "beat" or kind == "stopped":
+        if kind in ("running", "beat", "stopped"):
             self.beat = report
-        elif kind == "ready" and self.state is State.BUILDING:
+        if kind == "ready" and self.state is State.BUILDING:
             self.components = report.get("components", {})
             await self._enter(State.READY, seconds=round(time.monotonic() - life.started, 3))
             if self._may_start():
