@@ -1,4 +1,4 @@
-"""The card of a detection head: what its ONNX file takes, gives, was trained on and was measured to do.
+"""The card of a head: what its ONNX file takes, gives, was trained on and was measured to do.
 
 A head is two files side by side: the ONNX model and a YAML card that names it. A model that does not fit its card
 is refused before it runs.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, overload
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -17,7 +17,18 @@ from ..errors import ModelError
 from .classes import CLASSES
 from .onnx_file import NotOnnxError, external_data, opset
 
-__all__ = ["DEFAULT_CARD", "DecodeSpec", "HeadCard", "InputSpec", "OutputSpec", "file_sha256", "load_card", "save_card"]
+__all__ = [
+    "DEFAULT_CARD",
+    "DecodeSpec",
+    "HeadCard",
+    "InputSpec",
+    "LidarCard",
+    "ModelCard",
+    "OutputSpec",
+    "file_sha256",
+    "load_card",
+    "save_card",
+]
 
 DEFAULT_CARD = Path(__file__).parent / "weights" / "pillar_center.yaml"
 """The head that ships with warploom."""
@@ -80,8 +91,8 @@ class DecodeSpec(_Strict):
     max_objects: int = Field(ge=1)
 
 
-class HeadCard(_Strict):
-    """A head's card."""
+class ModelCard(_Strict):
+    """What every card says, whatever its network takes and gives."""
 
     name: str
     description: str = ""
@@ -89,11 +100,8 @@ class HeadCard(_Strict):
     """The ONNX file, beside the card."""
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
     opset: int = Field(ge=11, le=_HIGHEST_OPSET)
-    input: InputSpec
-    output: OutputSpec
     classes: tuple[str, ...]
-    """Of the heat maps, in order."""
-    decode: DecodeSpec
+    """In the order of the network."""
     training: dict[str, Any]
     """Data, seed, frames, iterations, minutes, recipe."""
     measured: dict[str, Any]
@@ -107,6 +115,14 @@ class HeadCard(_Strict):
             raise ValueError(f"must be the name of a file beside the card, not {value!r}")
         return value
 
+    def contradiction(self) -> str:
+        """What in it does not fit together; empty: nothing."""
+        return ""
+
+
+class LidarCard(ModelCard):
+    """A card whose network finds objects of the classes of `models.classes`."""
+
     @field_validator("classes")
     @classmethod
     def _classes_known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
@@ -116,17 +132,51 @@ class HeadCard(_Strict):
         return value
 
 
+class HeadCard(LidarCard):
+    """The card of a pillar centre head, see `models.head`."""
+
+    kind: Literal["pillar_center"] = "pillar_center"
+    input: InputSpec
+    output: OutputSpec
+    decode: DecodeSpec
+
+    def contradiction(self) -> str:
+        """What in it does not fit together."""
+        spec, low, high = self.input, self.input.point_range[:3], self.input.point_range[3:]
+        columns, rows = (round((high[axis] - low[axis]) / spec.cell) for axis in (0, 1))
+        wanted_in = (1, len(spec.channels), rows, columns)
+        if spec.shape != wanted_in:
+            return f"input.shape {spec.shape} does not follow from channels, range and cell: {wanted_in}"
+        stride = self.decode.stride
+        wanted_out = (len(self.classes) + len(self.output.regression), rows // stride, columns // stride)
+        if self.output.unfolded != wanted_out:
+            return f"output.shape {self.output.shape} does not follow from classes, regression and stride: {wanted_out}"
+        return ""
+
+
+Card = TypeVar("Card", bound=ModelCard)
+
+
 def file_sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def load_card(path: str | Path) -> tuple[HeadCard, Path]:
+@overload
+def load_card(path: str | Path) -> tuple[HeadCard, Path]: ...
+
+
+@overload
+def load_card(path: str | Path, kind: type[Card]) -> tuple[Card, Path]: ...
+
+
+def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[ModelCard, Path]:
     """Reads a card and checks that its model is there, is the one it means, and that card and model agree in shape.
 
     Args:
         path: The YAML file.
+        kind: What kind of card it must be.
 
     Returns:
         The card and the path of its ONNX file.
@@ -140,13 +190,14 @@ def load_card(path: str | Path) -> tuple[HeadCard, Path]:
     except OSError as error:
         raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
     try:
-        card = HeadCard.model_validate(yaml.safe_load(text))
+        card = kind.model_validate(yaml.safe_load(text))
     except yaml.YAMLError as error:
         raise ModelError(f"{path}: the card is not YAML: {error}") from error
     except ValidationError as error:
         reasons = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'card'}: {e['msg']}" for e in error.errors())
         raise ModelError(f"{path}: the card is not valid: {reasons}") from error
-    _check_consistency(path, card)
+    if contradiction := card.contradiction():
+        raise ModelError(f"{path}: {contradiction}")
     model = path.parent / card.file
     if not model.is_file():
         raise ModelError(f"{path}: the card's model {model} is not there; put the ONNX file beside its card")
@@ -168,23 +219,7 @@ def load_card(path: str | Path) -> tuple[HeadCard, Path]:
     return card, model
 
 
-def _check_consistency(path: Path, card: HeadCard) -> None:
-    """Refuses a card whose numbers contradict each other."""
-    spec, low, high = card.input, card.input.point_range[:3], card.input.point_range[3:]
-    columns, rows = (round((high[axis] - low[axis]) / spec.cell) for axis in (0, 1))
-    wanted_in = (1, len(spec.channels), rows, columns)
-    if spec.shape != wanted_in:
-        raise ModelError(f"{path}: input.shape {spec.shape} does not follow from channels, range and cell: {wanted_in}")
-    stride = card.decode.stride
-    wanted_out = (len(card.classes) + len(card.output.regression), rows // stride, columns // stride)
-    if card.output.unfolded != wanted_out:
-        raise ModelError(
-            f"{path}: output.shape {card.output.shape} does not follow from classes, regression and stride: "
-            f"{wanted_out}"
-        )
-
-
-def save_card(path: str | Path, card: HeadCard) -> None:
+def save_card(path: str | Path, card: ModelCard) -> None:
     """Writes a card as YAML."""
     content = yaml.safe_dump(card.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
     Path(path).write_text(content, encoding="utf-8")

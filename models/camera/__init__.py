@@ -1,0 +1,1 @@
+"""Heads for cameras: images in, boxes in the image or masks of it out."""
