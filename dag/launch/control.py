@@ -2,7 +2,7 @@
 
     → {"id": 1, "request": "ps"}
     ← {"id": 1, "ok": true, "result": {…}}
-    ← {"id": 2, "ok": false, "error": "no process 'lidra'; did you mean 'lidar'? …"}
+    ← {"id": 2, "ok": false, "error": "no process 'lidra'; did you mean 'lidar'? …", "asked_wrong": true}
 
 After `{"request": "watch"}` every event follows as a line `{"event": …}`, until the connection is closed.
 """
@@ -98,6 +98,8 @@ class ControlServer:
             return {"id": number, "ok": True, "result": await self._answers[name](request)}
         except TimeoutError:
             return {"id": number, "ok": False, "error": "the process gave no answer in time"}
+        except ConfigError as error:
+            return {"id": number, "ok": False, "error": str(error), "asked_wrong": True}
         except (WarploomError, ConnectionError) as error:
             return {"id": number, "ok": False, "error": str(error)}
 
@@ -150,7 +152,8 @@ class ControlClient:
         """One request and its answer.
 
         Raises:
-            WarploomError: It was refused, or nobody answers any more.
+            ConfigError: There is nothing of the name that was asked for.
+            WarploomError: It failed, or nobody answers any more.
         """
         self._number += 1
         try:
@@ -160,7 +163,8 @@ class ControlClient:
                 if "event" in answer:
                     continue
                 if not answer.get("ok"):
-                    raise WarploomError(str(answer.get("error")))
+                    kind = ConfigError if answer.get("asked_wrong") else WarploomError
+                    raise kind(str(answer.get("error")))
                 return answer.get("result")
         except (OSError, ValueError) as error:
             raise WarploomError(f"the supervisor does not answer: {error}") from error
