@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from ...datamesh import DataMesh, Input, Output, declared_handles
 from ...datamesh.transport import Exporter, ExportService, Importer, SharedMemoryConfig, ZenohConfig
-from ...datamesh.transport.zenoh_links import ZenohSession
+from ...datamesh.transport.zenoh_links import ZenohExporter, ZenohImporter, ZenohSession
 from ...errors import ConfigError
 from ..configuration import ConfigFile, import_class, nearest
 from ..graph import check_payloads, declare_vertices, graph_payloads, type_name
@@ -244,9 +244,10 @@ class Links:
             window = self._mesh.window(topic)
             links: list[_Link] = self._exports.setdefault(topic, [])
             try:
-                links.append(Exporter(window, self._service, node=self._node, name=self._name, config=self._shared))
+                shared = Exporter(window, self._service, node=self._node, name=self._name, config=self._shared)
+                links.append(shared)
                 if topic in self._plan.remote:
-                    links.append(self._session_of_zenoh().exporter(window))
+                    links.append(ZenohExporter(self._session_of_zenoh(), window, shared.order))
             except BaseException:
                 self.end_export(topic)
                 raise
@@ -264,7 +265,7 @@ class Links:
                 raise ConfigError(f"topic {topic!r} is committed by this process: it has no need to import it")
             window = self._mesh.window(topic)
             if topic in self._plan.remote:
-                link = self._session_of_zenoh().importer(window)
+                link = ZenohImporter(self._session_of_zenoh(), window)
             else:
                 blocks = topic in self._plan.blocking
                 link = Importer(window, node=self._node, name=self._name, config=self._shared, blocks=blocks)
@@ -274,7 +275,7 @@ class Links:
     def end_export(self, topic: str) -> None:
         """Ends what `export` began."""
         with self._lock:
-            for link in self._exports.pop(topic, []):
+            for link in reversed(self._exports.pop(topic, [])):
                 link.stop()
 
     def end_import(self, topic: str) -> None:
@@ -322,5 +323,5 @@ class Links:
 
     def _session_of_zenoh(self) -> ZenohSession:
         if self._session is None:
-            self._session = ZenohSession(self._zenoh, node=self._node, name=self._name)
+            self._session = ZenohSession(self._zenoh, node=self._node)
         return self._session

@@ -147,7 +147,8 @@ class Exporter:
         self._built = self._copied = Usage()
         self._listener = listen(node, window.topic)
         try:
-            self._order = OrderFile(node, window.topic)
+            self.order = OrderFile(node, window.topic)
+            """Under which epochs others see those of the window."""
             self._pool = SlabPool(self._config.memory_bytes)
         except BaseException:
             self._listener.close()
@@ -174,7 +175,7 @@ class Exporter:
             for reader in tuple(self._readers):
                 self._drop(reader)
             self._pool.close()
-            self._order.close()
+            self.order.close()
 
     # Memory
 
@@ -201,7 +202,7 @@ class Exporter:
         with self._lock:
             if self._stopped:
                 return
-            epoch = self._order.epoch(entry.epoch, entry.version)
+            epoch = self.order.epoch(entry.epoch, entry.version)
             self._counts["commits"] += 1
             if self._readers:
                 newest = self._window.snapshot(entry.epoch).versions[-1:] == (entry.version,)
@@ -211,7 +212,7 @@ class Exporter:
         with self._lock:
             if self._stopped:
                 return
-            seen = self._order.settled(epoch, version)
+            seen = self.order.settled(epoch, version)
             if seen is not None:
                 for reader in tuple(self._readers):
                     self._send(reader, Event(SETTLE, 0, seen, version, 0, 0))
@@ -349,7 +350,7 @@ class Exporter:
         reached = self._reached.pop(reader.name, (-1, -1))
         for index in range(max(0, len(snapshot) - self._config.history), len(snapshot)):
             entry = snapshot.entry(index)
-            epoch = self._order.epoch(entry.epoch, entry.version)
+            epoch = self.order.epoch(entry.epoch, entry.version)
             triggers = entry.triggers and (epoch, entry.version) > reached
             self._tell(entry._replace(triggers=triggers), epoch, False, [reader])
         reader.reached = max(reader.reached, reached)

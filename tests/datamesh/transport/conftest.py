@@ -30,11 +30,11 @@ def until(condition, what="it"):
 class Side:
     """One mesh and its links."""
 
-    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), **config):
+    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), remote=None, zenoh=None, **config):
         self.mesh = DataMesh(capacity)
-        self.plan = LinkPlan(tuple(exports), tuple(imports), tuple(blocking))
+        self.plan = LinkPlan(tuple(exports), tuple(imports), tuple(blocking), remote or {})
         config = SharedMemoryConfig(**{"memory_bytes": 1 << 24, "retry_ms": 2.0, **config})
-        self.links = Links(self.mesh, self.plan, node=node, name=name, shared_memory=config)
+        self.links = Links(self.mesh, self.plan, node=node, name=name, shared_memory=config, zenoh=zenoh)
         self.commits = {}
         self.settled = {}
         for topic in imports:
@@ -64,6 +64,8 @@ class Side:
 
     def counts(self, topic):
         return self.links.counters()[topic]
+
+    wait = staticmethod(until)
 
     def until(self, condition, topic, what=None):
         until(lambda: condition(self.counts(topic)), what or f"{topic}: {self.counts(topic)}")
@@ -152,8 +154,9 @@ def peer(node):
     """Starts other processes of the node; all are dead at the end of the test."""
     peers = []
 
-    def start(*arguments, of=node):
-        one = Peer((of, *arguments), {**os.environ})
+    def start(*arguments, of=node, zenoh=None):
+        environment = dict(os.environ) if zenoh is None else {**os.environ, "PEER_ZENOH": zenoh.model_dump_json()}
+        one = Peer((of, *arguments), environment)
         peers.append(one)
         return one
 

@@ -3,6 +3,8 @@
 write NAME TOPIC FIRST BYTES PERIOD_MS COUNT   commits clouds of one number, its version, built in place
 read NAME TOPIC                                says of each that it gets whether it is whole
 relay NAME FROM TO                             commits to TO what it reads of FROM
+
+Where PEER_ZENOH holds a configuration, it does so over zenoh.
 """
 
 import json
@@ -18,7 +20,7 @@ from warploom.dag import BacklogConfig, DataProcessComponent
 from warploom.dag.launch.linking import LinkPlan, Links
 from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
 from warploom.datamesh.messages import message
-from warploom.datamesh.transport import SharedMemoryConfig
+from warploom.datamesh.transport import SharedMemoryConfig, ZenohConfig
 
 CONFIG = SharedMemoryConfig(memory_bytes=1 << 28, retry_ms=2.0)
 
@@ -93,7 +95,10 @@ def main(node, kind, name, *arguments):
     """Does it until it is killed, or has written all."""
     mesh = DataMesh(8)
     topics = {"write": (arguments[:1], ()), "read": ((), arguments[:1]), "relay": (arguments[1:], arguments[:1])}[kind]
-    links = Links(mesh, LinkPlan(*topics), node=node, name=name, shared_memory=CONFIG)
+    zenoh = ZenohConfig.model_validate_json(os.environ["PEER_ZENOH"]) if "PEER_ZENOH" in os.environ else None
+    remote = dict.fromkeys(arguments, "zenoh") if zenoh is not None else {}
+    plan = LinkPlan(*topics, remote=remote)
+    links = Links(mesh, plan, node=node, name=name, shared_memory=CONFIG, zenoh=zenoh)
     if kind != "write":
         component = (Reader if kind == "read" else Relay)(name)
         component.bind(mesh, dict(zip(("data", "result"), arguments, strict=False)))

@@ -300,12 +300,12 @@ class TestDamage:
     def test_a_producer_of_another_user_is_not_believed(self, side, impostor, monkeypatch, caplog):
         monkeypatch.setattr(importing, "peer_of", lambda _: (1, 12345))
         with caplog.at_level(logging.WARNING):
-            side("reader", imports=["topic"])
+            reader = side("reader", imports=["topic"])
             one, _ = impostor.listener.accept()
             with one:
                 one.settimeout(30)
                 assert one.recv(MESSAGE) == b""
-        assert "another user" in caplog.text
+            reader.wait(lambda: "another user" in caplog.text)
 
     def test_a_producer_that_does_not_answer_keeps_nobody(self, side, impostor):
         reader = side("reader", imports=["topic"])
