@@ -13,6 +13,8 @@ from ..dag import VertexTiming
 if TYPE_CHECKING:
     import warp as wp
 
+    from ..datamesh import Completion
+
 __all__ = ["ExecutionContext", "Timings", "empty_cloud"]
 
 
@@ -65,6 +67,20 @@ class ExecutionContext:
     """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
     timings: Timings = field(default_factory=Timings, compare=False)
     """Tells the runs of vertices, if the process was built with it as its `on_timing`."""
+
+    @property
+    def stream(self) -> wp.Stream | None:
+        """Where processors launch, and read what others wrote on the device; None on a CPU."""
+        import warp as wp
+
+        device = wp.get_device(self.device)
+        return wp.get_stream(device) if device.is_cuda else None
+
+    def completion(self) -> Completion | None:
+        """The event after which what was launched so far is written; None on a CPU."""
+        from .completion import completion_on
+
+        return completion_on(self.device)
 
 
 def empty_cloud(device: str) -> tuple[wp.array, wp.array]:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ..datamesh import CURRENT_EPOCH, CommitPolicy, Entry, EqualVersion, Input, Outcome, Reorder, Status, Waiting
+from ..datamesh.payload import holds_device_array
 from .processor import In, Out, Processor, ProcessorConfig
 from .trigger import Trigger
 
@@ -244,7 +245,11 @@ class _CommitConfig(ProcessorConfig):
 
 
 class CommitDagProcessor(Processor):
-    """A vertex that sends a datum to the mesh, at the version of the trigger."""
+    """A vertex that sends a datum to the mesh, at the version of the trigger.
+
+    Where the context has a `stream`, on which processors launch, arrays on a device are committed with its
+    `completion()`: readers on the host or on other streams wait until they are written.
+    """
 
     Config = _CommitConfig
 
@@ -271,5 +276,7 @@ class CommitDagProcessor(Processor):
         """Commits; what the policy does not keep is counted."""
         with self._output.allocate_change() as change:
             change.set_version(trigger.version, trigger.received_ns, epoch=trigger.epoch)
-            change.value = self.value.value
+            change.value = value = self.value.value
+            if getattr(self.context, "stream", None) is not None and holds_device_array(value):
+                change.completes_with(self.context.completion())
             return self._output.commit(self._policy, change, equal=self._equal, triggers=self._triggers)

@@ -10,7 +10,17 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-__all__ = ["Allocatable", "Arena", "Completion", "Freezable", "checksum", "freeze", "host_array", "is_device_array"]
+__all__ = [
+    "Allocatable",
+    "Arena",
+    "Completion",
+    "Freezable",
+    "checksum",
+    "freeze",
+    "holds_device_array",
+    "host_array",
+    "is_device_array",
+]
 
 
 @runtime_checkable
@@ -108,6 +118,14 @@ def freeze(value: Any) -> None:
 def is_device_array(value: Any) -> bool:
     """Whether it is an array of Warp or torch, on whatever device."""
     return _kind(type(value)) == "device array"
+
+
+def holds_device_array(value: Any) -> bool:
+    """Whether there is an array of Warp or torch anywhere in a payload."""
+    kind = _kind(type(value))
+    if kind == "freezable" and dataclasses.is_dataclass(value):
+        kind = "dataclass"
+    return kind == "device array" or any(holds_device_array(part) for part in _parts(value, kind))
 
 
 def host_array(value: Any) -> np.ndarray:

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from warploom.components.completion import StreamCompletion, completion_on
+from warploom.components.execution import ExecutionContext
 from warploom.datamesh import CommitPolicy, Input, Output, Window
 from warploom.errors import DeviceError
 
@@ -18,6 +19,39 @@ def _count_up(rounds: int, values: wp.array(dtype=wp.int32)):
 
 def test_on_a_cpu_what_was_launched_is_done():
     assert completion_on("cpu") is None
+
+
+def test_the_context_of_a_cpu_has_neither_stream_nor_event():
+    context = ExecutionContext(device="cpu")
+    assert context.stream is None
+    assert context.completion() is None
+
+
+class Fake:
+    """Of a stream and its device, what an event needs."""
+
+    def __init__(self):
+        self.device, self.told = "cuda:0", []
+
+    def record_event(self, event):
+        self.told.append(("record", event))
+
+    def wait_event(self, event):
+        self.told.append(("wait", event))
+
+
+def test_the_event_is_recorded_on_the_stream_that_writes_and_waited_for_on_the_one_that_reads(monkeypatch):
+    """The calls that a CUDA device would be given, where there is none."""
+    waited = []
+    monkeypatch.setattr(wp, "Event", lambda device: f"event of {device}")
+    monkeypatch.setattr(wp, "synchronize_event", waited.append)
+    own, other, event = Fake(), Fake(), "event of cuda:0"
+    completion = StreamCompletion(own)
+    assert own.told == [("record", event)]
+    completion.wait_on(other)
+    assert (own.told, other.told, waited) == ([("record", event)], [("wait", event)], [])
+    completion.synchronize()
+    assert waited == [event]
 
 
 def test_a_device_that_is_not_there_is_refused():

@@ -77,6 +77,60 @@ def test_commits_at_the_version_of_the_trigger_with_its_time_of_reception_and_ep
     assert (entry.version, entry.value, entry.received_ns, entry.epoch) == (5, "datum", 123, 2)
 
 
+class Done:
+    """A completion that notes who waits for it."""
+
+    def __init__(self, stream):
+        self.stream, self.waited = stream, []
+
+    def synchronize(self):
+        self.waited.append("host")
+
+    def wait_on(self, stream):
+        self.waited.append(stream)
+
+
+class OnDevice:
+    """As an array of Warp or torch looks."""
+
+    def numpy(self):
+        raise AssertionError("nobody asked for it on the host")
+
+
+class Device:
+    """An execution context whose processors launch on a stream."""
+
+    stream = "own"
+
+    def __init__(self):
+        self.events = []
+
+    def completion(self):
+        self.events.append(Done(self.stream))
+        return self.events[-1]
+
+
+@pytest.mark.parametrize(
+    ("value", "carries"), [(OnDevice(), True), ({"boxes": [OnDevice()]}, True), ([1.0, "a"], False)]
+)
+def test_what_a_device_still_writes_is_committed_with_its_event(value, carries, committing):
+    harness, mesh = committing()
+    harness.processor.context = context = Device()
+    harness.feed(value=value).run(5)
+    assert harness.status is Status.OK
+    assert len(context.events) == carries
+    window = mesh.window("topic")
+    for stream in ("own", "other", None):
+        assert window.snapshot(stream=stream).last() is value
+    assert [event.waited for event in context.events] == [["other", "host"]] * carries
+
+
+def test_without_a_stream_nothing_is_waited_for(committing):
+    harness, mesh = committing()
+    harness.feed(value=OnDevice()).run(5)
+    assert mesh.window("topic").snapshot().entry(0).completion is None
+
+
 def test_an_older_version_is_discarded_and_counted(committing):
     harness, mesh = committing()
     assert statuses(harness, 5, 4, 5, 6) == [Status.OK, Status.OUT_OF_ORDER, Status.DUPLICATE, Status.OK]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from warploom.datamesh import Freezable, checksum, freeze
+from warploom.datamesh.payload import holds_device_array
 
 
 @dataclass
@@ -90,3 +91,13 @@ def test_torch_and_warp_arrays_have_checksums():
     array.fill_(1.0)
     assert checksum(tensor) != before[0]
     assert checksum({"a": array}) != before[1]
+
+
+def test_an_array_of_a_device_is_found_at_any_depth():
+    torch = pytest.importorskip("torch")
+    wp = pytest.importorskip("warp")
+
+    for array in (wp.zeros(1), torch.zeros(1)):
+        assert holds_device_array(array)
+        assert holds_device_array({"a": [(1, array)]})
+    assert not holds_device_array({"a": [(1, np.zeros(1), "text")]})
