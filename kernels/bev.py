@@ -24,7 +24,7 @@ __all__ = ["BevMaps", "bev"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
+_LEAST_PART = 100_000  # points; fewer take less time than waking a second thread
 _HEIGHT, _INTENSITY, _DENSITY = (wp.constant(i) for i in range(3))
 _HIGHEST, _COUNT = (wp.constant(i) for i in range(2))  # the columns of a cell
 _LOW_WORD = wp.constant(wp.int64(0x7FFFFFFF))

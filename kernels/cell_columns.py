@@ -16,10 +16,10 @@ import warp as wp
 
 from .cell_pairs import Radius, cell_of, is_finite, level_of_x, x_of_level
 from .device import DEFAULT_DEVICE
-from .threads import launch_parts, thread_count
+from .threads import PackedLaunch, launch_parts, thread_count
 from .unchecked import at, put
 
-__all__ = ["LEAST_MAP", "MAP_PER_POINT", "CellColumns", "Layout", "aligned", "is_before", "parts_for", "row_of"]
+__all__ = ["CellColumns", "Layout", "aligned", "is_before", "parts_for", "row_of"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -31,9 +31,6 @@ _MOST_CELLS = wp.constant(wp.int64(2**31 - 1))
 _WIDE_BITS = wp.constant(11)  # of a digit of clouds too wide for two digits made to measure
 _WIDE_DIGITS = wp.constant(1 << 11)
 _POINTS_WORTH_A_THREAD = 6_000
-
-LEAST_MAP, MAP_PER_POINT = 1 << 20, 16
-"""Places that a map of columns has, at least and per point of the capacity."""
 
 
 @wp.struct
@@ -563,40 +560,36 @@ class CellColumns:
         self._low_counts, self._high_counts, self._next_place = (buffer((self.parts, digits)) for _ in range(3))
         self._used = wp.zeros(1, dtype=wp.int32, device=DEFAULT_DEVICE)
 
+        has_levels = int(radius.per_metre > 0)
+        given = [self.cells, self._bounds, self.point_count, has_levels]
+        self._find_cells = self.packed(
+            _find_cells,
+            [None, None, None, 0, radius],
+            [self.cells, self.cell_of_point, self._bounds, self.point_count],
+        )
+        self._count_digits = self.packed(_count_digits, given, [self._digits, self._low_counts, self._high_counts])
+        self._sort_low = self.packed(
+            _sort_low,
+            [*given, self._digits, self._low_counts],
+            [self._next_place, self._by_low, self.order, self._used, self.layout],
+        )
+        self._sort_high = self.packed(
+            _sort_high,
+            [None, self.cells, self.layout, self._used, self._high_counts, self._by_low],
+            [self._next_place, self.order, self.cell_of_point, self.points, self.stacks, self.columns, self.ranges],
+        )
+
+    def packed(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> PackedLaunch:
+        """The launch of a kernel once per part."""
+        return PackedLaunch(kernel, self.parts, inputs, outputs)
+
     def run(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
         """Launches a kernel once per part."""
         launch_parts(kernel, self.parts, inputs, outputs)
 
     def launch(self, xyz: wp.array, count: wp.array, include: wp.array, has_include: int) -> None:
         """Fills everything."""
-        has_levels = int(self.radius.per_metre > 0)
-        self.run(
-            _find_cells,
-            [xyz, count, include, has_include, self.radius],
-            [self.cells, self.cell_of_point, self._bounds, self.point_count],
-        )
-        self.run(
-            _count_digits,
-            [self.cells, self._bounds, self.point_count, has_levels],
-            [self._digits, self._low_counts, self._high_counts],
-        )
-        self.run(
-            _sort_low,
-            [self.cells, self._bounds, self.point_count, has_levels, self._digits, self._low_counts],
-            [self._next_place, self._by_low, self.order, self._used, self.layout],
-        )
-        self.run(
-            _sort_high,
-            [xyz, self.cells, self.layout, self._used, self._high_counts, self._by_low],
-            [
-                *(
-                    self._next_place,
-                    self.order,
-                    self.cell_of_point,
-                    self.points,
-                    self.stacks,
-                    self.columns,
-                ),
-                self.ranges,
-            ],
-        )
+        self._find_cells.launch(xyz_in=xyz, count_in=count, include_in=include, has_include=has_include)
+        self._count_digits.launch()
+        self._sort_low.launch()
+        self._sort_high.launch(xyz_in=xyz)

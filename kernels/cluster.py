@@ -23,6 +23,7 @@ from .cluster_levels import join_levels_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
+from .threads import PackedLaunch
 
 __all__ = ["EuclideanCluster", "cluster"]
 
@@ -142,9 +143,14 @@ class EuclideanCluster:
         if sequential:
             by_cell = CellColumns(self._radius, self.capacity)
             keep("_by_cell", by_cell)
-            keep("_joined", JoinedColumns(by_cell))
+            columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
+            joined = JoinedColumns(by_cell, *columns, self._radius)
+            keep("_joined", joined)
             cells = self.capacity + by_cell.parts
-            keep("_members", wp.empty(cells, dtype=wp.int32, device=device))
+            members = wp.empty(cells, dtype=wp.int32, device=device)
+            given = [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, by_cell.point_count, self.min_size]
+            labelled = [joined.parent, members, self.labels, self.cluster_count]
+            keep("_label", PackedLaunch(label_points, None, given, labelled))
             if self.radius_per_metre > 0:
                 slots = 2 << (self.capacity - 1).bit_length()
                 keep("_table", wp.full(slots, -1, dtype=wp.int32, device=device))
@@ -174,33 +180,30 @@ class EuclideanCluster:
                 raise ValueError(f"include must be bool or uint8 with at least {n} rows, as there are points")
             mask, has_include = include.view(wp.uint8) if include.dtype == wp.bool else include, 1
         if self._sequential:
-            self._launch_in_order(n, [xyz, count, mask, has_include])
+            self._launch_in_order([xyz, count, mask, has_include])
         elif n == 0:
             self.cluster_count.zero_()
         else:
             self._by_cell.launch(xyz, count, mask, has_include)
             self._launch_shared(n)
 
-    def _launch_in_order(self, n: int, given: list) -> None:
-        by_cell, radius, parent = self._by_cell, self._radius, self._joined.parent
-        columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
+    def _launch_in_order(self, given: list) -> None:
+        by_cell, joined = self._by_cell, self._joined
         by_cell.launch(*given)
-        self._joined.launch(by_cell.layout, *columns, radius)
-
-        def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-            wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
-
+        joined.launch()
         if self.radius_per_metre > 0:
-            run(
+            columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
+            wp.launch(
                 join_levels_in_order,
-                [*columns, None, radius],
-                [self._table, parent, self._cells, self._slots, self._cell_begin, self._cell_end],
+                1,
+                inputs=[*columns, None, self._radius],
+                outputs=[
+                    *(self._table, joined.parent, self._cells, self._slots),
+                    *(self._cell_begin, self._cell_end),
+                ],
+                device=self.device,
             )
-        run(
-            label_points,
-            [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, self.min_size],
-            [parent, self._members, self.labels[:n], self.cluster_count],
-        )
+        self._label.launch()
 
     def _launch_shared(self, n: int) -> None:
         by_cell, radius = self._by_cell, self._radius

@@ -17,6 +17,7 @@ from .cell_columns import CellColumns, Layout
 from .cell_pairs import TOUCH, Radius
 from .column_neighbors import FORWARD, LIST_NEIGHBORS, map_places
 from .device import DEFAULT_DEVICE
+from .threads import PackedLaunch
 
 __all__ = ["JoinedColumns", "label_points"]
 
@@ -358,7 +359,7 @@ def join_borders(
         for (int c = ranges.data[p][0]; c < ranges.data[p][1]; ++c)
             if (root_of[c] == c) label_of[c] = label_of[c] >= min_size ? UNNUMBERED : -1;
     int clusters = 0;
-    const int points = labels_out.shape[0];
+    const int points = point_count.data[0];
     const int* __restrict cell_of = cell_of_point.data;
     int* __restrict label_out = labels_out.data;
     for (int i = 0; i < points; ++i) {
@@ -376,6 +377,7 @@ def _label(
     ranges: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     cell_of_point: wp.array(dtype=wp.int32),
+    point_count: wp.array(dtype=wp.int32),
     min_size: int,
     parent: wp.array(dtype=wp.int32),
     members: wp.array(dtype=wp.int32),
@@ -391,6 +393,7 @@ def label_points(
     ranges: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     cell_of_point: wp.array(dtype=wp.int32),
+    point_count: wp.array(dtype=wp.int32),
     min_size: int,
     # in out: members left as labels
     parent: wp.array(dtype=wp.int32),
@@ -400,35 +403,46 @@ def label_points(
     cluster_count_out: wp.array(dtype=wp.int32),
 ):
     """Counts each component's points, numbers those with enough in the order of their first, and labels the points."""
-    _label(ranges, stacks, cell_of_point, min_size, parent, members, labels_out, cluster_count_out)
+    _label(ranges, stacks, cell_of_point, point_count, min_size, parent, members, labels_out, cluster_count_out)
 
 
 class JoinedColumns:
     """Workspace to join the cells of columns that touch; `parent` tells the components."""
 
-    def __init__(self, by_cell: CellColumns):
-        """Makes it for whatever columns these can be."""
+    def __init__(
+        self,
+        by_cell: CellColumns,
+        ranges: wp.array,
+        columns: wp.array,
+        stacks: wp.array,
+        points: wp.array,
+        radius: Radius,
+    ):
+        """Makes it for columns such as `CellColumns` has; they may be those of some of its points."""
         capacity = by_cell.points.shape[0]
         cells = capacity + by_cell.parts
 
         def buffer(length: int, dtype: type = wp.int32) -> wp.array:
             return wp.empty(length, dtype=dtype, device=DEFAULT_DEVICE)
 
-        self.by_cell = by_cell
         self.parent = buffer(cells)
         """Of each cell one of its component, and of that itself."""
-        self.column_map = wp.full(map_places(capacity), -1, dtype=wp.int32, device=DEFAULT_DEVICE)
-        """Free between launches, with -1 everywhere."""
-        self._own = [
-            *(buffer(FORWARD * capacity), buffer(capacity, wp.uint64), buffer(capacity)),
-            *(buffer(cells), buffer(cells, wp.uint64), buffer(cells)),
-        ]
+        given = [columns, stacks, points, radius]
+        self._join = by_cell.packed(
+            join_own_columns,
+            [by_cell.layout, ranges, *given],
+            [
+                wp.full(map_places(capacity), -1, dtype=wp.int32, device=DEFAULT_DEVICE),
+                *(buffer(FORWARD * capacity), buffer(capacity, wp.uint64), buffer(capacity)),
+                *(buffer(cells), buffer(cells, wp.uint64), buffer(cells), self.parent),
+            ],
+        )
+        self._join_borders = None
+        if by_cell.parts > 1:
+            self._join_borders = PackedLaunch(join_borders, None, [ranges, *given], [self.parent])
 
-    def launch(
-        self, layout: wp.array, ranges: wp.array, columns: wp.array, stacks: wp.array, points: wp.array, radius: Radius
-    ) -> None:
-        """Joins the cells of columns such as `CellColumns` has; they may be those of some of its points."""
-        cells = [columns, stacks, points, radius]
-        self.by_cell.run(join_own_columns, [layout, ranges, *cells], [self.column_map, *self._own, self.parent])
-        if self.by_cell.parts > 1:
-            wp.launch(join_borders, 1, inputs=[ranges, *cells], outputs=[self.parent], device=DEFAULT_DEVICE)
+    def launch(self) -> None:
+        """Joins the cells."""
+        self._join.launch()
+        if self._join_borders is not None:
+            self._join_borders.launch()

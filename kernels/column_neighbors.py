@@ -6,9 +6,9 @@ are looked up on a map, or, of a cloud too wide for one, met by going along the 
 
 from __future__ import annotations
 
-from .cell_columns import LEAST_MAP, MAP_PER_POINT
-
 __all__ = ["FORWARD", "LIST_NEIGHBORS", "map_places"]
+
+_LEAST_MAP, _MAP_PER_POINT = 1 << 20, 16
 
 FORWARD = 12
 """Columns up to two away that come after a column; the first four share a corner with it, and two of these a side."""
@@ -72,4 +72,4 @@ LIST_NEIGHBORS = """
 
 def map_places(capacity: int) -> int:
     """How many places the map of a plan for up to `capacity` points has."""
-    return max(LEAST_MAP, MAP_PER_POINT * capacity)
+    return max(_LEAST_MAP, _MAP_PER_POINT * capacity)

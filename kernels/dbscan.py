@@ -20,6 +20,7 @@ from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, is_near, radius_of, touch, unite
 from .cell_table import CellTable, cell_at, free_slot
 from .cluster_columns import JoinedColumns, label_points
+from .column_neighbors import map_places
 from .dbscan_columns import find_cores, label_others, map_columns, pick_cores, unmap_columns
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
@@ -328,11 +329,9 @@ class Dbscan:
             keep(name, wp.empty(shape, dtype=dtype, device=DEFAULT_DEVICE))
 
         keep("_by_cell", by_cell)
-        keep("_of_cores", JoinedColumns(by_cell))
         around = sorted(np.ndindex(5, 5), key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
         keep("_around", wp.array(np.array(around, np.int32) - 2, dtype=wp.vec2i, device=DEFAULT_DEVICE))
-        places = self._of_cores.column_map.shape[0]
-        keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=DEFAULT_DEVICE))
+        keep("_column_map", wp.full(map_places(self.capacity), -1, dtype=wp.int32, device=DEFAULT_DEVICE))
         keep("_core_ranges", wp.zeros(by_cell.parts, dtype=wp.vec4i, device=DEFAULT_DEVICE))
         buffer("_neighbours", wp.vec2i, (by_cell.parts, len(around)))
         buffer("_core_columns", wp.vec4i)
@@ -340,6 +339,8 @@ class Dbscan:
         buffer("_core_points", wp.vec3)
         for name in ("_near", "_core_cell", "_core_cell_of_point", "_members"):
             buffer(name)
+        cores = [self._core_ranges, self._core_columns, self._core_stacks, self._core_points]
+        keep("_of_cores", JoinedColumns(by_cell, *cores, self._radius))
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -420,12 +421,12 @@ class Dbscan:
             [*columns, *cells, by_cell.order, self._near, least],
             [*cores, self._core_cell, self._core_cell_of_point],
         )
-        of_cores.launch(by_cell.layout, *cores, self._radius)
+        of_cores.launch()
         wp.launch(
             label_points,
             1,
-            inputs=[self._core_ranges, self._core_stacks, self._core_cell_of_point, 1],
-            outputs=[of_cores.parent, self._members, self.labels[: xyz.shape[0]], self.cluster_count],
+            inputs=[self._core_ranges, self._core_stacks, self._core_cell_of_point, by_cell.point_count, 1],
+            outputs=[of_cores.parent, self._members, self.labels, self.cluster_count],
             device=self.device,
         )
         # The other points.

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .cell_columns import LEAST_MAP, MAP_PER_POINT, CellColumns
+from .cell_columns import CellColumns
 from .cell_pairs import Radius, unite
 from .cell_table import CellTable, cell_at
 from .cluster_columns import label_points
+from .column_neighbors import map_places
 from .device import DEFAULT_DEVICE, resolve_device
 from .grid_columns import join_border_voxels, join_own_voxels
 from .interop import borrow_points, count_on, give
@@ -125,8 +126,7 @@ class GridCluster:
             for name in ("_parent", "_members", "_places"):
                 keep(name, wp.empty(self.capacity + by_cell.parts, dtype=wp.int32, device=device))
             keep("_masks", wp.empty(self.capacity, dtype=wp.uint64, device=device))
-            places = max(LEAST_MAP, MAP_PER_POINT * self.capacity)
-            keep("_column_map", wp.full(places, -1, dtype=wp.int32, device=device))
+            keep("_column_map", wp.full(map_places(self.capacity), -1, dtype=wp.int32, device=device))
         else:
             keep("_by_cell", CellTable(grid, self.capacity, device))
 
@@ -171,8 +171,8 @@ class GridCluster:
             run(join_border_voxels, voxels, [self._parent])
         run(
             label_points,
-            [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, self.min_size],
-            [self._parent, self._members, self.labels[: xyz.shape[0]], self.cluster_count],
+            [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, by_cell.point_count, self.min_size],
+            [self._parent, self._members, self.labels, self.cluster_count],
         )
 
 

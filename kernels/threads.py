@@ -20,7 +20,7 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 
-__all__ = ["CREW", "forks_taken_by", "launch_parts", "run_together", "set_thread_count", "thread_count"]
+__all__ = ["CREW", "PackedLaunch", "forks_taken_by", "launch_parts", "run_together", "set_thread_count", "thread_count"]
 
 CREW = "warploom-kernels-"
 """What the names of the threads begin with."""
@@ -163,6 +163,69 @@ def run_together(calls: Sequence[Callable[[], Any]]) -> None:
         raise failed
 
 
+class PackedLaunch:
+    """A kernel's launch on the CPU, whose parameters are packed once but for some that change.
+
+    To pack them takes longer than the launch. For one thread at a time, as a plan is.
+    """
+
+    def __init__(self, kernel: Any, parts: int | None, inputs: Sequence[Any], outputs: Sequence[Any] = ()):
+        """Packs nothing yet.
+
+        Args:
+            kernel: A Warp kernel. With `parts` its first two parameters are the part, 0 … parts − 1, and `parts`.
+            parts: How many times it is launched, all at once, each time with one thread, which does that part's
+                whole work; None for a kernel without these two, which is launched once.
+            inputs: The parameters that follow.
+            outputs: Those that it writes.
+        """
+        self._kernel, self._parts = kernel, parts
+        self._given = [*inputs, *outputs]
+        self._own = 0 if parts is None else 2  # parameters before those given
+        self._index = {argument.label: index for index, argument in enumerate(kernel.adj.args)}
+        self._commands: list[Any] = []
+        self._device = wp.get_device(DEFAULT_DEVICE)
+
+    def launch(self, **changed: Any) -> None:
+        """Launches it.
+
+        Args:
+            **changed: Parameters by name, in place of what was last given.
+        """
+        places = {self._index[name]: value for name, value in changed.items()}
+        if self._device.is_capturing or not self._commands:
+            given = list(self._given)
+            for index, value in places.items():
+                given[index - self._own] = value
+            if self._device.is_capturing:
+                run_together([partial(self._launch, part, given) for part in range(self._parts or 1)])
+                return
+            self._record(given)
+        else:
+            for command in self._commands:
+                for index, value in places.items():
+                    command.set_param_at_index(index, value)
+        if len(self._commands) == 1:
+            self._commands[0].launch()
+        else:
+            run_together([command.launch for command in self._commands])
+
+    def _launch(self, part: int, given: list[Any], **how: Any) -> Any:
+        own = [] if self._parts is None else [part, self._parts]
+        return wp.launch(self._kernel, 1, inputs=[*own, *given], device=DEFAULT_DEVICE, **how)
+
+    def _record(self, given: list[Any]) -> None:
+        # A module that is not loaded yet is loaded once; the others differ by the part alone.
+        first = self._launch(0, given, record_cmd=True)
+        first.fwd_args = None  # what changes is not kept alive
+        self._commands = [first]
+        for part in range(1, self._parts or 1):
+            command = copy(first)
+            command.params = list(command.params)
+            command.set_param_at_index(0, part)
+            self._commands.append(command)
+
+
 def launch_parts(kernel: Any, parts: int, inputs: Sequence[Any], outputs: Sequence[Any] = ()) -> None:
     """Launches a kernel for the CPU once per part, all at once.
 
@@ -173,23 +236,4 @@ def launch_parts(kernel: Any, parts: int, inputs: Sequence[Any], outputs: Sequen
         inputs: The parameters that follow.
         outputs: Those that it writes.
     """
-
-    def launch(part: int, **how: Any) -> Any:
-        given = [part, parts, *inputs]
-        return wp.launch(kernel, 1, inputs=given, outputs=list(outputs), device=DEFAULT_DEVICE, **how)
-
-    if parts == 1:
-        launch(0)
-        return
-    if wp.get_device(DEFAULT_DEVICE).is_capturing:
-        run_together([partial(launch, part) for part in range(parts)])
-        return
-    # Recorded here, where a module that is not loaded yet is loaded once; the others differ by the part alone, and to
-    # pack all parameters again would take longer than to launch them.
-    commands = [launch(0, record_cmd=True)]
-    for part in range(1, parts):
-        command = copy(commands[0])
-        command.params = list(command.params)
-        command.set_param_at_index(0, part)
-        commands.append(command)
-    run_together([command.launch for command in commands])
+    PackedLaunch(kernel, parts, inputs, outputs).launch()
