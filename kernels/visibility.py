@@ -67,7 +67,7 @@ def _look(
     distance = wp.length(direction)
     if distance > max_range:
         return
-    _, instance, _, _, _ = first_hit(
+    _distance, instance, _face, _label, _normal = first_hit(
         i, origin, direction / distance, fraction, wp.max(distance - _GAP, 0.0), seed_in[world], scene_in[world],
         world * max_instances, mesh_in, first_face_in, rows_in, motion_in, label_in, material_in,
     )  # fmt: skip

@@ -1,7 +1,10 @@
 """A LiDAR simulator: procedural streets, sensor models, ray casting, and ground truth for every point and object."""
 
+from .cameras import Camera, CameraFrame
+from .ego_sensors import GnssModel, ImuModel, WheelSpeedModel, local_from_geodetic
 from .frame import SimulatedFrame
 from .labels import GROUND_CLASSES, PointClass
+from .radar import Radar, RadarFrame
 from .scenarios import SCENARIOS
 from .scenes import SceneBatch, sample_scene
 from .sensors import LIDARS, Lidar, lidar_model
@@ -12,12 +15,20 @@ __all__ = [
     "GROUND_CLASSES",
     "LIDARS",
     "SCENARIOS",
+    "Camera",
+    "CameraFrame",
+    "GnssModel",
+    "ImuModel",
     "Lidar",
     "PointClass",
+    "Radar",
+    "RadarFrame",
     "SceneBatch",
     "SimulatedFrame",
     "Simulator",
+    "WheelSpeedModel",
     "compensated",
     "lidar_model",
+    "local_from_geodetic",
     "sample_scene",
 ]

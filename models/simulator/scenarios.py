@@ -64,21 +64,21 @@ def _street(random: np.random.Generator, seed: int, duration: float) -> Drive:
 
 
 def _occlusion(random: np.random.Generator, seed: int, duration: float) -> Drive:
-    """The sensor stands; a rider at 6 m/s passes behind a parked van, a walker behind a bus stop's worth of cars.
+    """The sensor stands; on the left a rider passes behind a parked van, on the right a walker behind a parked car.
 
-    The van's shadow on the rider's way is some 7 m long, so the rider is hidden for about a second.
+    The van's shadow on the rider's way is some 9 m long, so at 6.5 m/s the rider is hidden for about a second.
     """
     motion = (0.0, 0.0, 0.0, 0.0)
     street, plan = _begin(random, seed, duration, motion, [], 0.0)
     add = street.add
     far = plan.half_width + 1.6
-    add("van", 11.0, 4.9, np.pi, variant=0, scale=(1, 1, 1))
-    add("cyclist", 33.0, far, np.pi, motion=(6.0, 0.0, 0.0, 0.0), margin=0.05)
+    add("van", 4.0, 4.9, np.pi, variant=0, scale=(1, 1, 1))
+    add("cyclist", 33.0, far, np.pi, motion=(6.5, 0.0, 0.0, 0.0), margin=0.05)
     add("suv", 6.0, -5.1, 0.0, variant=0, scale=(1, 1, 1))
     add("pedestrian", 0.5, -far, 0.0, motion=(1.4, 0.0, 0.0, 0.0), margin=0.05)
     # The rest of the side that the rider is seen on stays free of what would hide him too.
     for s in np.arange(-30.0, 40.0, 2.0):
-        if abs(s - 11.0) > 4.0:
+        if abs(s - 4.0) > 4.0:
             street.block(s, 4.6, 1.6)
         street.block(s, far, 1.0)
     furnish(street, plan, 0.5)

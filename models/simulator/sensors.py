@@ -45,8 +45,9 @@ class Lidar:
     """Share of the echoes that are lost for no reason."""
     divergence: float = 3.0
     """Width of a beam [mrad]: what lies within it gives one echo."""
-    pulse: float = 1.0
-    """Surfaces nearer to each other along a beam than this give one echo, in between [m]."""
+    pulse: float = 0.5
+    """Surfaces nearer to each other along a beam than this give one echo, in between [m]: half of how far light goes
+    while a pulse of some 3 ns lasts."""
     azimuth_offset: np.ndarray | float = 0.0
     """Of each laser to the left of where the sensor faces [deg]; shape (lines,), or one for all."""
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ...kernels.device import resolve_device
+from .cameras import Camera, CameraFrame, CameraView
 from .ego import EgoPath, mounting
+from .ego_sensors import Gnss, GnssModel, Imu, ImuModel, WheelSpeed, WheelSpeedModel
 from .frame import SimulatedFrame
 from .library import Library
+from .radar import Radar, RadarFrame
 from .scenarios import build_drive
 from .sensors import Lidar, lidar_model
 from .sweep import START_NS, caster, observe
@@ -68,6 +71,7 @@ class Simulator:
         self._cast = caster(library, self.lidar, 1.0 / rate, wetness=1.0 if rain > 0 else 0.0)
         self._cast.set_rain(rain)
         self._mounting = mounting(mounting_height, 0.0, 0.0)
+        self._views: dict[Camera, CameraView] = {}
         self._running = threading.Lock()
 
     def __len__(self) -> int:
@@ -121,3 +125,44 @@ class Simulator:
                 seed=self.seed * 1_000_003 + index, index=index, version=self.version(index),
                 visibility=self.visibility,
             )  # fmt: skip
+
+    def image(self, index: int, camera: Camera, *, delay: float = 0.0) -> CameraFrame:
+        """What a camera sees `delay` seconds after the reference time of a frame.
+
+        Raises:
+            IndexError: There is no such frame.
+        """
+        t = self.time(index) + delay
+        with self._running:
+            if camera not in self._views:
+                self._views[camera] = CameraView(self._world.library, camera)
+            return self._views[camera].look(
+                self._world, self.pose, t, version=self.version(index) + round(delay * 1e9),
+                seed=self.seed * 1_000_003 + index,
+            )  # fmt: skip
+
+    def radar(self, frame: SimulatedFrame, radar: Radar) -> RadarFrame:
+        """What a radar sees at the reference time of a frame of this drive."""
+        return radar.measure(frame, velocity=self.velocity(frame.index), seed=self.seed * 1_000_003 + frame.index)
+
+    def velocity(self, index: int) -> np.ndarray:
+        """Of the LiDAR over ground at the reference time of a frame, along its axes [m/s], shape (3,).
+
+        Raises:
+            IndexError: There is no such frame.
+        """
+        t = self.time(index)
+        step = self.pose(t + 1e-3)[:3, 3] - self.pose(t - 1e-3)[:3, 3]
+        return self.pose(t)[:3, :3].T @ step / 2e-3
+
+    def imu(self, model: ImuModel | None = None) -> Imu:
+        """What an IMU at the vehicle's origin measures of the whole drive."""
+        return (model or ImuModel()).measure(self.vehicle_pose, self.duration, self.seed)
+
+    def gnss(self, model: GnssModel | None = None, *, outages: Sequence[tuple[float, float]] = ()) -> Gnss:
+        """The GNSS fixes of the whole drive but for `outages`, beginning and end [s]."""
+        return (model or GnssModel()).measure(self.vehicle_pose, self.duration, self.seed, outages=outages)
+
+    def wheel_speed(self, model: WheelSpeedModel | None = None) -> WheelSpeed:
+        """What the wheels say of the whole drive."""
+        return (model or WheelSpeedModel()).measure(self.vehicle_pose, self.duration, self.seed)
