@@ -16,7 +16,7 @@ __all__ = ["MOST_CANDIDATES", "Pairs", "Search", "assign_stage", "offer"]
 MOST_CANDIDATES = wp.constant(wp.int32(32))
 """Pairs kept of a track: of more that are possible, those that cost least."""
 
-_WORK = wp.constant(wp.int32(30_000_000))
+_WORK = wp.constant(wp.int32(10_000_000))
 _NONE = wp.constant(wp.int32(-1))
 _FAR = wp.constant(wp.float64(1e300))
 
@@ -177,7 +177,7 @@ def _take_cheapest(pairs: Pairs, search: Search, sure: wp.array(dtype=wp.int32),
 def assign_stage(pairs: Pairs, search: Search, sure: wp.array(dtype=wp.int32), stage: int, tracks: int, first_tag: int):
     """The cheapest one-to-one assignment of the detections of one stage to the tracks that have none yet.
 
-    Where the search takes more than 30 million steps, as among thousands of objects in one place, the tracks left take
+    Where the search takes more than 10 million steps, as among thousands of objects in one place, the tracks left take
     the cheapest detection that is free: time is bounded, and `work[1]` says so.
 
     Args:

@@ -112,6 +112,13 @@ def use_detection(j: int, frame: Frame):
     total = wp.float64(0.0)
     for k in range(8):
         total += frame.given[j, k]
+    # First the place, by which detections of no use are in order too.
+    x = frame.given[j, 0]
+    y = frame.given[j, 1]
+    z = frame.given[j, 2]
+    for k in range(3):
+        at = POSE + 4 * k
+        frame.used[j, k] = frame.real[at] * x + frame.real[at + 1] * y + frame.real[at + 2] * z + frame.real[at + 3]
     frame.stage[j] = 0
     kind = frame.given_whole[j, 0]
     if frame.given_whole[j, 1] != 0:
@@ -128,12 +135,6 @@ def use_detection(j: int, frame: Frame):
         wp.atomic_add(frame.counts, WEAK, wp.int64(1))
         return
     frame.stage[j] = wp.where(score >= frame.parameters[kind, HIGH_SCORE], 1, 2)
-    x = frame.given[j, 0]
-    y = frame.given[j, 1]
-    z = frame.given[j, 2]
-    for k in range(3):
-        at = POSE + 4 * k
-        frame.used[j, k] = frame.real[at] * x + frame.real[at + 1] * y + frame.real[at + 2] * z + frame.real[at + 3]
     for k in range(3, 6):
         frame.used[j, k] = frame.given[j, k]
         frame.used[j, Z_SIZES + k - 3] = wp.log(frame.given[j, k])

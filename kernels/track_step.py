@@ -36,6 +36,7 @@ from .track_table import (
     ID,
     KEPT,
     KIND,
+    LARGEST,
     LEAST_SIZE,
     LIMIT,
     MOST,
@@ -71,6 +72,10 @@ __all__ = ["TrackStep"]
 
 wp.set_module_options({"fuse_fp": False, "max_unroll": 1})
 
+_DIAGONAL = wp.constant(wp.float64(2.0**0.5))
+# Pairs of a frame that are looked at closely, and of a track at least: time is bounded however many are in one place.
+_LOOKS, _LEAST_LOOKS = wp.constant(wp.int32(2_000_000)), wp.constant(wp.int32(256))
+
 
 @wp.kernel
 def _make_ready(
@@ -90,15 +95,6 @@ def _make_ready(
         search.detection_price[i] = wp.float64(0.0)
         search.reached[i] = 0
         use_detection(i, frame)
-
-
-@wp.func
-def _cost_of_size(f: wp.array2d(dtype=wp.float64), i: int, used: wp.array2d(dtype=wp.float64), j: int) -> wp.float64:
-    square = wp.float64(0.0)
-    for k in range(3):
-        ratio = used[j, Z_SIZES + k] - wp.log(wp.max(f[i, 3 + k], LEAST_SIZE))
-        square += ratio * ratio
-    return square
 
 
 @wp.func
@@ -141,6 +137,9 @@ def _find_pairs(
     reach = limit
     volume = wp.float64(0.0)
     slim = wp.float64(1.0)
+    sizes = wp.vec3d()
+    for k in range(3):
+        sizes[k] = wp.log(wp.max(real[i, 3 + k], LEAST_SIZE))
     if cost == 0:
         most = frame.parameters[kind, NEAR_LIMIT] * wider * wider
         near = frame.parameters[kind, NEAR]
@@ -151,6 +150,8 @@ def _find_pairs(
     elif cost == 1:
         volume = real[i, 3] * real[i, 4] * real[i, 5]
         slim = wp.min(real[i, 3], real[i, 4]) * real[i, 5]
+        # The enclosing box is at least as large as one box drawn as far as the other one is away.
+        reach = _DIAGONAL * (volume + frame.real[LARGEST]) / ((wp.float64(1.0) + limit) * slim)
     else:
         limit = limit * wider
         reach = limit
@@ -159,15 +160,21 @@ def _find_pairs(
     first = int(0)
     last = int(m)
     in_order = frame.whole[SORTED] != wp.int64(0)
-    if in_order and cost != 1:
+    if in_order:
         first = _first_from(frame, m, x - reach)
+        last = _first_from(frame, m, x + reach)
+        # Among thousands in one place those nearest along x must do.
+        most_looked_at = wp.max(_LOOKS / int(frame.whole[TRACKS]), _LEAST_LOOKS)
+        if last - first > most_looked_at:
+            frame.counts[CUT] = wp.int64(1)
+            middle = _first_from(frame, m, x)
+            first = wp.max(first, middle - most_looked_at / 2)
+            last = wp.min(last, middle + most_looked_at / 2)
     for k in range(first, last):
         j = int(k)
         if in_order:
             j = frame.order[k]
         dx = frame.used[j, 0] - x
-        if in_order and cost != 1 and dx > reach:
-            break
         if frame.stage[j] != 0 and frame.parameters[frame.kind[j], GROUP] == group:
             dy = frame.used[j, 1] - y
             price = wp.float64(1.0)
@@ -177,15 +184,18 @@ def _find_pairs(
                     dz = frame.used[j, 2] - real[i, 2]
                     square += dz * dz / sz
                     if square < limit * limit:
-                        square += frame.parameters[kind, SIZE_WEIGHT] * _cost_of_size(real, i, frame.used, j)
+                        apart = wp.float64(0.0)
+                        for size in range(3):
+                            ratio = frame.used[j, Z_SIZES + size] - sizes[size]
+                            apart += ratio * ratio
+                        square += frame.parameters[kind, SIZE_WEIGHT] * apart
                         price = wp.sqrt(square) / limit
             elif cost == 2:
                 price = wp.sqrt(dx * dx + dy * dy) / limit
             else:
-                # The enclosing box is at least as large as one box drawn as far as the other one is away.
                 other = frame.used[j, 3] * frame.used[j, 4] * frame.used[j, 5]
                 far = wp.max(wp.abs(dx), wp.abs(dy)) * slim
-                if far * (wp.float64(1.0) + limit) <= wp.float64(1.4142135623730952) * (volume + other):
+                if far * (wp.float64(1.0) + limit) <= _DIAGONAL * (volume + other):
                     overlap = giou(box_of(real, i), box_of(frame.used, j))
                     price = (wp.float64(1.0) - overlap) / (wp.float64(1.0) - limit)
             if price < wp.float64(1.0):
@@ -223,7 +233,8 @@ def _decide(
     search.work[1] = 0
     assign_stage(pairs, search, frame.stage, 1, n, 1)
     assign_stage(pairs, search, frame.stage, 2, n, 1 + n)
-    frame.counts[CUT] = wp.int64(search.work[1])
+    if search.work[1] != 0:
+        frame.counts[CUT] = wp.int64(1)
     kept = int(0)
     shown = int(0)
     for i in range(n):
@@ -329,7 +340,8 @@ class TrackStep:
     """In: `PARAMETERS` of each kind, shape (kinds, 28), float64."""
     frame_real: np.ndarray = field(init=False, repr=False, compare=False)
     """In: seconds since the last frame; factor on the gates; on scores of the unseen; on evidence; least weight of a
-    score; world from sensor, 3 × 4 by rows; shape (17,), float64."""
+    score; the largest volume of a detection where `order` is to be used; world from sensor, 3 × 4 by rows; shape (18,),
+    float64."""
     frame_whole: np.ndarray = field(init=False, repr=False, compare=False)
     """In: now [ns]; tracks; detections; the next id; number of the frame from 1; whether `order` is to be used; the
     most tracks; shape (7,), int64."""
@@ -341,7 +353,7 @@ class TrackStep:
     order: np.ndarray = field(init=False, repr=False, compare=False)
     """In: rows of the detections in the order of x among the tracks, shape (detections,), int32."""
     counts: np.ndarray = field(init=False, repr=False, compare=False)
-    """Out: `COUNTS`, shape (8,), int64; those of what is dropped go on rising."""
+    """Out: `COUNTS`, shape (8,), int64; from the fourth on they go on rising until they are set to zero."""
     report: np.ndarray = field(init=False, repr=False, compare=False)
     """Out: box, vx vy, turn rate, score, covariance of x y vx vy; shape (tracks, 27), float64."""
     report_whole: np.ndarray = field(init=False, repr=False, compare=False)
@@ -359,7 +371,7 @@ class TrackStep:
 
         frame = Frame()
         frame.parameters = zeros((self.kinds, len(PARAMETERS)), wp.float64)
-        frame.real, frame.whole = zeros(17, wp.float64), zeros(7, wp.int64)
+        frame.real, frame.whole = zeros(18, wp.float64), zeros(7, wp.int64)
         frame.given, frame.given_whole = zeros((m, GIVEN), wp.float64), zeros((m, 2), wp.int32)
         frame.order, frame.used = zeros(m, wp.int32), zeros((m, USED), wp.float64)
         frame.kind, frame.stage = zeros(m, wp.int32), zeros(m, wp.int32)

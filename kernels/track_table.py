@@ -38,6 +38,7 @@ __all__ = [
     "ID",
     "KEPT",
     "KIND",
+    "LARGEST",
     "LEAST_SCORE",
     "LEAST_SIZE",
     "LIMIT",
@@ -142,8 +143,9 @@ WHOLE = 7
 # Columns of the measurements as they are given, and as they are used, then with logarithms of the sizes.
 Z_SCORE, Z_VX, Z_RADIAL, Z_SIZES = (wp.constant(wp.int32(i)) for i in (7, 8, 10, 14))
 GIVEN, USED = 14, 17
-# Of the frame, real: seconds; widening of gates; factors of scores and evidence; world from sensor, 12 numbers.
-DT, WIDER, COASTED, MEMORY, WEIGHT, POSE = (wp.constant(wp.int32(i)) for i in range(6))
+# Of the frame, real: seconds; widening of gates; factors of scores and evidence; the largest volume; world from
+# sensor, 12 numbers.
+DT, WIDER, COASTED, MEMORY, WEIGHT, LARGEST, POSE = (wp.constant(wp.int32(i)) for i in range(7))
 # Whole.
 NOW, TRACKS, DETECTIONS, NEXT_ID, FRAME, SORTED, MOST = (wp.constant(wp.int32(i)) for i in range(7))
 COUNTS = ("tracks", "reported", "born", "not finite", "size not positive", "low score", "over capacity", "cut short")

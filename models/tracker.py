@@ -201,12 +201,13 @@ class Tracker:
             self.config.class_memory,
             self.config.score_weight,
         )
-        step.frame_real[5:] = _NO_POSE if pose is None else pose[:3].ravel()
+        step.frame_real[6:] = _NO_POSE if pose is None else pose[:3].ravel()
         step.frame_whole[:] = (
             version, self._count, n, self._next_id, self._frames, in_order, self.config.max_tracks,
         )  # fmt: skip
         if in_order:
-            along = boxes[:, :3] @ step.frame_real[5:8] + step.frame_real[8]
+            along = boxes[:, :3] @ step.frame_real[6:9] + step.frame_real[9]
+            step.frame_real[5] = np.nanmax(boxes[:, 3:6].prod(1), initial=0.0)
             step.order[:n] = np.argsort(along, kind="stable")
             step.send("order")
         step.send("given", "given_whole", "frame_real", "frame_whole")
@@ -306,7 +307,7 @@ class Tracker:
         step = self._step
         self._count, shown, born, *dropped, cut_short = step.counts.tolist()
         self._next_id += born
-        if any(dropped):
+        if cut_short or any(dropped):
             self._count_dropped(*dropped)
             step.counts[:] = 0
             step.send("counts")
