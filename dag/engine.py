@@ -219,7 +219,7 @@ class GraphEngine:
                 vertex.queue.append(run)
             for vertex in self._roots:
                 ready += self._offer(vertex)
-            wakes = self._claim(ready - serves)
+            wakes = self._claim(ready - serves) if ready > serves else 0
         for _ in range(wakes):
             self._wakes.put(None)
 
