@@ -303,7 +303,7 @@ def bench_engine(benchmark, shape, workers):
 
 
 def bench_deadlines(benchmark):
-    """20 vertices with 0.1 ms of work each, in five branches at 100 Hz on two workers; and the work in a plain thread."""
+    """20 vertices with 0.1 ms of work each, in five branches at 100 Hz on two workers; and that work in one thread."""
     mesh, timings = DataMesh(), []
     component = DagComponent("component")
     component.add_handles(["sent"], [])
