@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import pathlib
 import time
 
 import numpy as np
@@ -34,24 +35,23 @@ class HdmapStruct:
         self.number = number
 
 
-class HdmapManager(DataProcessComponent):
-    lidar: Input[Cloud]
-    hdmap: Output[HdmapStruct]
+def example(document):
+    """The first Python of a document, as it stands there, with the one method that it leaves out."""
+    code = document.read_text(encoding="utf-8").partition("```python\n")[2].partition("```")[0]
+    kinds = (DataProcessComponent, Input, Output, Cloud, HdmapStruct, CommitPolicy, Status)
+    names = {"__name__": __name__, "log": log, **{kind.__name__: kind for kind in kinds}}
+    exec(compile(code, str(document), "exec"), names)
 
-    def process(self, trigger):
-        with self.lidar.access() as snapshot:
-            index = snapshot.version_index(trigger.version)
-            if index == -1:
-                log.info("no lidar at the trigger version: %s", snapshot.miss(trigger.version))
-                return Status.MISS
-            cloud = snapshot[index]
-        with self.hdmap.allocate_change() as change:
-            change.set_version(trigger.version)
-            change.value = self.query(cloud)
-            return self.hdmap.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+    class HdmapManager(names["HdmapManager"]):
+        def query(self, cloud):
+            return HdmapStruct(cloud.number * 10)
 
-    def query(self, cloud):
-        return HdmapStruct(cloud.number * 10)
+    return HdmapManager
+
+
+ROOT = pathlib.Path(__file__).parents[2]
+SPECIFICATION = ROOT.parent / "shared" / "spec" / "datamesh.md"
+HdmapManager = example(ROOT / "docs" / "datamesh.md")
 
 
 def bound(kind, window=None):
@@ -67,10 +67,12 @@ def publish(output, version, value, received_ns=None):
         return output.commit(DISCARD, change)
 
 
-@pytest.fixture
-def manager():
+@pytest.fixture(params=["documentation", "specification"])
+def manager(request):
+    if request.param == "specification" and not SPECIFICATION.is_file():
+        pytest.skip("the specification (../shared/spec) is not here")
     mesh = DataMesh(window_capacity=2)
-    component = HdmapManager("hdmap_manager")
+    component = (HdmapManager if request.param == "documentation" else example(SPECIFICATION))("hdmap_manager")
     component.bind(mesh, {"lidar": "lidar/points", "hdmap": "map/local"})
     lidar = bound(Output, mesh.window("lidar/points"))
     return mesh, component, lidar
