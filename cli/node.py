@@ -125,7 +125,7 @@ def _launch(planned: Launch, *, check: bool, skip: Any, as_json: bool) -> None:
         raise typer.Exit(run_launch(planned, on_event=JsonLines(), log_level=level))
     table = LiveTable()
     try:
-        code = run_launch(planned, on_event=table, log_level=level, show=table.show)
+        code = run_launch(planned, on_event=table, log_level=level, table=table)
     finally:
         table.close()
     raise typer.Exit(code)

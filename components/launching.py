@@ -30,11 +30,15 @@ if TYPE_CHECKING:
     from ..dag.launch.plan import LaunchPlan
     from ..dag.launch.preflight import Finding
     from ..dag.launch.run_folder import RunFolder
+    from ..dag.launch.table import LiveTable
 
 __all__ = ["DEFAULT_PROFILE", "Launch", "check_launch", "monitor_processes", "plan_launch", "run_launch"]
 
 DEFAULT_PROFILE = "cpu"
 """Of a launch that names none."""
+
+REFRESH_S = 2.0
+"""How often the table on a terminal is drawn where nothing happens [s]."""
 
 _log = logging.getLogger(__name__)
 
@@ -175,7 +179,11 @@ def build_process(
 
 
 def run_launch(
-    launch: Launch, *, on_event: Callable[[dict[str, Any]], None], log_level: str = "warning", show: Any = None
+    launch: Launch,
+    *,
+    on_event: Callable[[dict[str, Any]], None],
+    log_level: str = "warning",
+    table: LiveTable | None = None,
 ) -> int:
     """Runs a node until it ends.
 
@@ -183,7 +191,7 @@ def run_launch(
         launch: The plan.
         on_event: Is told of everything that happens.
         log_level: Of the processes.
-        show: Is given the supervisor before it starts.
+        table: Shows the node on the terminal while it runs.
 
     Returns:
         0 after a stop that was asked for, 2 where a process could not be built, 1 where one died for good.
@@ -210,9 +218,17 @@ def run_launch(
             "log_level": log_level,
         }
 
-    supervisor = Supervisor(plan, launch.links, command, reap=reap, on_event=on_event, child_plan=child_plan)
-    if show is not None:
-        show(supervisor)
+    supervisor = Supervisor(
+        plan,
+        launch.links,
+        command,
+        reap=reap,
+        on_event=on_event,
+        child_plan=child_plan,
+        refresh=None if table is None else (REFRESH_S, table.refresh),
+    )
+    if table is not None:
+        table.show(supervisor)
     return supervisor.run()
 
 

@@ -268,7 +268,6 @@ class SupervisedProcess:
             elif kind == "start":
                 self._send(life, {"do": "start"})
             elif kind == "report":
-                life.heard = now
                 if await self._take_report(life, what):
                     due = None if self.spec.health_timeout_s is None else now + self.spec.health_timeout_s
                 if self.state is State.READY:
@@ -398,10 +397,11 @@ class SupervisedProcess:
         assert process.stdout is not None
         output, _ = await loop.connect_read_pipe(lambda: _Output(self._take_output), process.stdout)
         now = time.monotonic()
-        task = asyncio.create_task(self._read_reports(reader, mail))
         if self._asked_to_stop:
             mail.put_nowait(("stop", None))
-        return _Life(process, pidfd, now, writer, [task], output, mail, now)
+        life = _Life(process, pidfd, now, writer, [], output, mail, now)
+        life.tasks.append(asyncio.create_task(self._read_reports(reader, life)))
+        return life
 
     @staticmethod
     def _ended(
@@ -416,13 +416,17 @@ class SupervisedProcess:
             os.killpg(process.pid, signal.SIGKILL)
         mail.put_nowait(("exit", process.wait()))
 
-    @staticmethod
-    async def _read_reports(reader: asyncio.StreamReader, mail: asyncio.Queue[tuple[str, Any]]) -> None:
+    async def _read_reports(self, reader: asyncio.StreamReader, life: _Life) -> None:
         with contextlib.suppress(OSError, ValueError, asyncio.LimitOverrunError):
             while line := await reader.readline():
                 report = json.loads(line)
-                if isinstance(report, dict):
-                    mail.put_nowait(("report", report))
+                if not isinstance(report, dict):
+                    continue
+                life.heard = time.monotonic()
+                if report.get("report") == "beat" and not report.get("hanging"):
+                    self.beat = report  # all that there is to do in most of the seconds of a life
+                else:
+                    life.mail.put_nowait(("report", report))
 
     def _take_output(self, data: bytes) -> None:
         self._log.write(data)

@@ -47,6 +47,7 @@ class Supervisor:
         reap: Callable[[str], Sequence[str]] = lambda node: (),
         on_event: Callable[[Event], None] = lambda event: None,
         child_plan: Callable[[ProcessSpec], Mapping[str, Any]] = lambda spec: {},
+        refresh: tuple[float, Callable[[], None]] | None = None,
     ) -> None:
         """Makes it; nothing is started.
 
@@ -57,6 +58,7 @@ class Supervisor:
             reap: Removes what dead processes of the node have left of their transport; gives the names of that.
             on_event: Is told of everything that happens.
             child_plan: What a process is told in its plan file, further to its name.
+            refresh: Every how many seconds something is called that shows the state; None: never.
         """
         self.plan = plan
         self.links = links
@@ -67,6 +69,7 @@ class Supervisor:
         self._reap = reap
         self._on_event = on_event
         self._child_plan = child_plan
+        self._refresh = refresh
         self._groups = ControlGroups()
         self._gate_open = False
         self._ending: asyncio.Event = asyncio.Event()
@@ -113,11 +116,12 @@ class Supervisor:
             self._tell({"event": "launching", "pid": os.getpid(), "processes": list(self.processes)})
             lives = {name: asyncio.create_task(process.live()) for name, process in self.processes.items()}
             watch = [asyncio.create_task(self._watch(self.processes[name], task)) for name, task in lives.items()]
-            opening = asyncio.create_task(self._open_gate())
+            beside = [asyncio.create_task(self._open_gate()), asyncio.create_task(self._show())]
             await self._ending.wait()
-            opening.cancel()
+            beside[0].cancel()
             await self._stop()
             await asyncio.gather(*watch)
+            beside[1].cancel()
             self._clean()
             self._tell({"event": "ended", "code": self._exit_code, "reason": self._reason})
             return self._exit_code
@@ -183,6 +187,11 @@ class Supervisor:
             if process.state is State.READY:
                 process.go()
         self._tell({"event": "up", "seconds": round(time.monotonic() - self._started, 3)})
+
+    async def _show(self) -> None:
+        while self._refresh is not None:
+            await asyncio.sleep(self._refresh[0])
+            self._refresh[1]()
 
     async def _watch(self, process: SupervisedProcess, life: asyncio.Task[None]) -> None:
         """Ends the node where the end of a process asks for that."""

@@ -1,0 +1,188 @@
+"""The launcher: what a supervisor costs while nothing happens, how fast a node starts and a killed process is back."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import psutil
+import pytest
+import yaml
+
+from warploom.bench.contest import peer, record_figure
+
+COMMAND = "from warploom.cli import main; main()"
+IDLE_S = 20.0
+KILLS = 5
+MODULE = """\
+module: {name}
+components:
+  - {{name: {name}, kind: generic, class: warploom.bench.launched.Nothing}}
+  - name: {name}_commits
+    kind: data
+    class: warploom.bench.launched.Commits
+    trigger: {{period_ms: 100}}
+    outputs: {{out: {name}/out}}
+"""
+SUPERVISORD = """\
+[supervisord]
+nodaemon=true
+logfile={folder}/log
+pidfile={folder}/pid
+"""
+
+
+class Node:
+    """A launched node whose events are read, or shown on a terminal."""
+
+    def __init__(self, folder, processes, *, terminal=False):
+        for number in range(processes):
+            (folder / f"m{number}.yaml").write_text(MODULE.format(name=f"m{number}"))
+        content = {
+            "node": "bench",
+            "processes": [
+                {"name": f"p{n}", "modules": [f"m{n}.yaml"], "back_off": {"first_s": 0.0}, "restarts": {"limit": 1000}}
+                for n in range(processes)
+            ],
+        }
+        path = folder / "bench.launch.yaml"
+        path.write_text(yaml.safe_dump(content))
+        self.events = []
+        self._changed = threading.Condition()
+        self._terminal = pty.openpty() if terminal else None
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-c", COMMAND, "launch", str(path)],
+            stdout=subprocess.PIPE if self._terminal is None else self._terminal[1],
+            env={**os.environ, "WARPLOOM_RUN": str(folder / "run"), "TERM": "xterm"},
+        )
+        if self._terminal is not None:
+            os.close(self._terminal[1])
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self):
+        if self._terminal is None:
+            for line in self.process.stdout:
+                with self._changed:
+                    self.events.append((time.perf_counter(), json.loads(line)))
+                    self._changed.notify_all()
+            return
+        try:
+            while data := os.read(self._terminal[0], 1 << 16):
+                if "up: seconds" in data.decode(errors="replace"):
+                    with self._changed:
+                        self.events.append((time.perf_counter(), {"event": "up"}))
+                        self._changed.notify_all()
+        except OSError:  # the end of a terminal
+            pass
+
+    def wait_for(self, count=1, **wanted):
+        """The time of an event, and the event."""
+
+        def found():
+            return [one for one in self.events if wanted.items() <= one[1].items()]
+
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(found()) >= count, 120), self.events
+        return found()[count - 1]
+
+    def close(self):
+        """Stops it."""
+        self.process.terminate()
+        self.process.wait(60)
+        self._thread.join()
+        if self._terminal is not None:
+            os.close(self._terminal[0])
+        else:
+            self.process.stdout.close()
+
+
+@pytest.fixture
+def node(tmp_path):
+    nodes = []
+
+    def node(processes, **how):
+        nodes.append(Node(tmp_path, processes, **how))
+        return nodes[-1]
+
+    yield node
+    for one in nodes:
+        one.close()
+
+
+def idle_share(pid, seconds=IDLE_S):
+    """The share of a core that a process uses while nothing happens [%], and how often it wakes up in a second."""
+    one = psutil.Process(pid)
+    time.sleep(2.0)
+    before, woken, start = one.cpu_times(), one.num_ctx_switches(), time.perf_counter()
+    time.sleep(seconds)
+    after, woken_after, passed = one.cpu_times(), one.num_ctx_switches(), time.perf_counter() - start
+    spent = after.user + after.system - before.user - before.system
+    return 100 * spent / passed, (woken_after.voluntary - woken.voluntary) / passed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("processes", "terminal"), [(2, False), (8, False), (2, True)])
+def bench_idle_supervisor(benchmark, node, processes, terminal):
+    """What watching costs: signs of life come, nothing else happens."""
+    one = node(processes, terminal=terminal)
+    one.wait_for(event="up")
+    shares = []
+    benchmark.pedantic(lambda: shares.append(idle_share(one.process.pid)), rounds=1)
+    share, woken = shares[0]
+    memory = psutil.Process(one.process.pid).memory_info().rss / 2**20
+    name = f"idle supervisor of {processes} processes" + (", table on a terminal" if terminal else "")
+    note = f"CPU time over {IDLE_S:g} s; wakes {woken:.1f} times a second; {memory:.0f} MiB"
+    benchmark.extra_info.update(kernel="launcher", on=f"{processes} processes")
+    record_figure(benchmark, name, share, "% of a core", goal=1.0, note=note)
+
+
+@pytest.mark.slow
+def bench_idle_supervisord(benchmark, tmp_path):
+    """The same of supervisord, whose processes sleep and give no signs of life."""
+    peer("supervisor")
+    text = SUPERVISORD.format(folder=tmp_path)
+    for number in range(2):
+        text += f"[program:p{number}]\ncommand=/bin/sleep 1000\n"
+    (tmp_path / "supervisord.conf").write_text(text)
+    command = [sys.executable, "-W", "ignore", "-m", "supervisor.supervisord", "-c", str(tmp_path / "supervisord.conf")]
+    one = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        time.sleep(3.0)
+        shares = []
+        benchmark.pedantic(lambda: shares.append(idle_share(one.pid)), rounds=1)
+    finally:
+        one.terminate()
+        one.wait(60)
+    note = f"CPU time over {IDLE_S:g} s; wakes {shares[0][1]:.1f} times a second"
+    benchmark.extra_info.update(kernel="launcher", on="2 processes")
+    record_figure(benchmark, "supervisord of 2 processes", shares[0][0], "% of a core", note=note)
+
+
+@pytest.mark.slow
+def bench_start_and_respawn(benchmark, node):
+    """From the command to all processes running; and from kill -9 to the process running again."""
+    start = time.perf_counter()
+    one = node(2)
+    up = one.wait_for(event="up")[0] - start
+    told, back = [], []
+
+    def kill():
+        number = len(told) + 1
+        pid = one.wait_for(number, event="state", process="p0", state="running")[1]["pid"]
+        killed = time.perf_counter()
+        os.kill(pid, signal.SIGKILL)
+        told.append(one.wait_for(number, event="died", process="p0")[0] - killed)
+        back.append(one.wait_for(number + 1, event="state", process="p0", state="running")[0] - killed)
+
+    benchmark.extra_info.update(kernel="launcher", on="2 processes")
+    benchmark.pedantic(kill, rounds=KILLS)
+    record_figure(benchmark, "warploom launch of 2 processes, to all running", up, "s", note="from the command")
+    note = f"median of {KILLS}"
+    record_figure(benchmark, "death noticed after kill -9", np.median(told) * 1e3, "ms", note=note)
+    record_figure(benchmark, "kill -9 to running again, back-off 0", np.median(back), "s", note=note)
