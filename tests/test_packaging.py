@@ -38,7 +38,7 @@ def expected_files() -> set[str]:
         parts = path.relative_to(ROOT).parts
         if parts[0].startswith(".") or parts[0] in NOT_PACKAGED or "__pycache__" in parts or "egg-info" in parts[0]:
             continue
-        is_data = (parts[0] == "conf" and path.suffix == ".yaml") or parts[:2] == ("models", "weights")
+        is_data = (parts[0] == "conf" and path.suffix in (".yaml", ".xml")) or parts[:2] == ("models", "weights")
         if path.is_file() and (path.suffix == ".py" or is_data):
             files.add("/".join(parts))
     return files
