@@ -1,0 +1,27 @@
+"""The 80 classes of COCO in the order of its detectors, and which of ours they are."""
+
+from ..classes import CYCLIST, PEDESTRIAN, VEHICLE
+
+__all__ = ["COCO_CLASSES", "ROAD_CLASSES"]
+
+COCO_CLASSES = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
+    "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow",
+    "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella", "handbag", "tie", "suitcase", "frisbee", "skis",
+    "snowboard", "sports ball", "kite", "baseball bat", "baseball glove", "skateboard", "surfboard",
+    "tennis racket", "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple", "sandwich",
+    "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch", "potted plant", "bed",
+    "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard", "cell phone", "microwave", "oven",
+    "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier",
+    "toothbrush",
+)  # fmt: skip
+
+ROAD_CLASSES = {
+    "person": PEDESTRIAN,
+    "bicycle": CYCLIST,
+    "motorcycle": CYCLIST,
+    "car": VEHICLE,
+    "bus": VEHICLE,
+    "truck": VEHICLE,
+}
+"""Indices into `models.classes.CLASSES` of those that are on roads."""
