@@ -203,7 +203,7 @@ TOUCH = (
     };
     // Crowded cells: both sides are narrowed to what lies near the other's box before pairs are tried.
     const auto touch_large = [&](const vec3* a, const int a_size, const vec3* b, const int b_size,
-                                 const float surely, const float surely_not) {
+                                 const float surely, const float surely_not) __attribute__((noinline)) {
         const float infinite = INFINITY;
         vec3 low[2], high[2];
         int left[2] = {a_size, b_size};
@@ -239,7 +239,7 @@ TOUCH = (
         }
         return false;
     };
-    const auto touch = [&](const int a_begin, const int a_end, const int b_begin, const int b_end) {
+    const auto touch = [&](const int a_begin, const int a_end, const int b_begin, const int b_end) __attribute__((noinline)) {
         const vec3 *a = points.data + a_begin, *b = points.data + b_begin;
         const int a_size = a_end - a_begin, b_size = b_end - b_begin;
         float surely = radius.surely, surely_not = radius.surely_not;

@@ -49,7 +49,7 @@ _JOIN = (
         above[swapped ? root : other] = swapped ? other : root;
     };
     // All cells of two columns, or of one, that touch; of any height.
-    const auto join_columns = [&](const int k, const int other) {
+    const auto join_columns = [&](const int k, const int other) __attribute__((noinline)) {
         int low = column[other][2];
         const int end = column[other][3];
         for (int a = column[k][2]; a < column[k][3]; ++a) {
@@ -76,7 +76,11 @@ _JOIN = (
     int* __restrict root_of = column_root.data;
     const Mask* __restrict mask_of = (const Mask*)masks.data;
     const vec3* __restrict point = points.data;
+    #ifdef __CUDA_ARCH__
+    const auto popcount = [](const Mask mask) { return __popcll(mask); };
+    #else
     const auto popcount = [](const Mask mask) { return (int)__builtin_popcountll(mask); };
+    #endif
     const auto below = [](const Mask bit) { return bit - 1; };
     const auto lowest = [](const Mask mask) { return mask & (~mask + 1); };
     const auto bottom = [&](const int k) { return height(column[k][2]); };
@@ -116,7 +120,7 @@ _JOIN = (
     // Cells side by side.
     constexpr int BLOCK = 256;
     int pair[BLOCK + 32][2], pairs = 0;
-    const auto unite_pairs = [&]() {
+    const auto unite_pairs = [&]() __attribute__((noinline)) {
         for (int i = 0; i < pairs; ++i) {
             const int a = find(pair[i][0]), b = find(pair[i][1]);
             above[a < b ? b : a] = a < b ? a : b;
@@ -171,7 +175,7 @@ _JOIN = (
         }
         first_segment[end] = segment;
     };
-    const auto join = [&](const int k, const int other, const int reach) {
+    const auto join = [&](const int k, const int other, const int reach) __attribute__((noinline)) {
         const Mask here = mask_of[k], there = mask_of[other];
         if (here == 0 || there == 0) {
             join_columns(k, other);
