@@ -1,4 +1,4 @@
-"""The Dockerfile and the systemd unit: read, and linted where the tools are. No image is built: that needs an engine."""
+"""The Dockerfile and the systemd unit: read, and linted where the tools are. Building an image needs an engine."""
 
 import configparser
 import json
