@@ -152,18 +152,30 @@ def _put(value: Any, parts: list[Any], depth: int, place: Place | None = None) -
     elif cls is tuple or cls is list:
         parts.append((b"t" if cls is tuple else b"l") + _COUNT.pack(len(value)))
         for index, item in enumerate(value):
-            _put_at(f"[{index}]", item, parts, depth, place)
+            try:
+                _put(item, parts, depth + 1, place)
+            except TypeError as error:
+                raise TypeError(f"[{index}]: {error}") from None
     elif cls is dict:
         parts.append(b"d" + _COUNT.pack(len(value)))
         for key, item in value.items():
-            _put_at("a key", key, parts, depth, None)
-            _put_at(f"[{key!r}]", item, parts, depth, place)
+            try:
+                _put(key, parts, depth + 1)
+            except TypeError as error:
+                raise TypeError(f"a key: {error}") from None
+            try:
+                _put(item, parts, depth + 1, place)
+            except TypeError as error:
+                raise TypeError(f"[{key!r}]: {error}") from None
     elif (kind := _by_class.get(cls)) is not None:
-        _put_bytes(b"m", kind.name.encode(), parts)
-        parts.append(_COUNT.pack(len(kind.fields)))
-        for name in kind.fields:
-            _put_bytes(b"", name.encode(), parts)
-            _put_at(f"{cls.__name__}.{name}", getattr(value, name), parts, depth, place)
+        head, names = _heads(kind)
+        parts.append(head)
+        for name, field in zip(kind.fields, names, strict=True):
+            parts.append(field)
+            try:
+                _put(getattr(value, name), parts, depth + 1, place)
+            except TypeError as error:
+                raise TypeError(f"{cls.__name__}.{name}: {error}") from None
     elif isinstance(value, np.generic) and not value.dtype.hasobject:
         parts.append(b"n")
         _put(_dtype_text(value.dtype), parts, depth + 1)
@@ -176,11 +188,13 @@ def _put(value: Any, parts: list[Any], depth: int, place: Place | None = None) -
         )
 
 
-def _put_at(where: str, value: Any, parts: list[Any], depth: int, place: Place | None) -> None:
-    try:
-        _put(value, parts, depth + 1, place)
-    except TypeError as error:
-        raise TypeError(f"{where}: {error}") from None
+@functools.lru_cache(maxsize=1024)
+def _heads(kind: MessageType) -> tuple[bytes, tuple[bytes, ...]]:
+    """What stands before the fields of a message, and before each of them."""
+    parts: list[Any] = []
+    _put_bytes(b"m", kind.name.encode(), parts)
+    names = [name.encode() for name in kind.fields]
+    return b"".join((*parts, _COUNT.pack(len(names)))), tuple(_COUNT.pack(len(name)) + name for name in names)
 
 
 def _put_bytes(kind: bytes, content: bytes, parts: list[Any]) -> None:
@@ -194,12 +208,11 @@ def _put_array(array: np.ndarray, parts: list[Any], place: Place | None) -> None
     if array.dtype.hasobject:
         raise TypeError(f"an array of {array.dtype}: Python objects have no bytes of their own")
     where = None if place is None or not array.size else place(array)
-    parts.append(b"a" if where is None else b"r")
-    parts.append(_dtype_bytes(array.dtype))
-    parts.append(_COUNT.pack(array.ndim) + b"".join(_SIZE.pack(size) for size in array.shape))
+    shape = array.shape
     if where is not None:
-        parts.append(_COUNT.pack(where[0]) + _SIZE.pack(where[1]))
+        parts.append(b"r" + _dtype_bytes(array.dtype) + struct.pack(f"<I{len(shape)}QIQ", len(shape), *shape, *where))
         return
+    parts.append(b"a" + _dtype_bytes(array.dtype) + struct.pack(f"<I{len(shape)}Q", len(shape), *shape))
     # A view of the memory: it is copied once, when the parts are joined. Dates have no buffer, bytes have.
     parts.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.size else b"")
 
@@ -280,7 +293,11 @@ class Decoder:
         return self.data[self.position - size : self.position]
 
     def _count(self) -> int:
-        return _COUNT.unpack(self._take(4))[0]
+        position = self.position
+        if position + 4 > len(self.data):
+            self._take(4)
+        self.position = position + 4
+        return _COUNT.unpack_from(self.data, position)[0]
 
     def _bytes(self) -> bytes:
         return bytes(self._take(self._count()))
@@ -329,7 +346,7 @@ class Decoder:
         dimensions = self._count()
         if dimensions > 32:
             raise ValueError(f"an array of {dimensions} dimensions")
-        shape = tuple(_SIZE.unpack(self._take(8))[0] for _ in range(dimensions))
+        shape = struct.unpack(f"<{dimensions}Q", self._take(8 * dimensions))
         size = math.prod(shape)
         if size == 0 and max(shape) >= 1 << 62:
             raise ValueError(f"an array of shape {shape}")
@@ -365,10 +382,11 @@ class Decoder:
         kind = _by_name.get(name)
         if kind is None:
             raise ValueError(f"no type is registered as message {name!r}: import the module that defines it")
-        missing = [field for field in kind.fields if field not in values and field not in kind.optional]
-        unknown = [field for field in values if field not in kind.fields]
-        if missing or unknown:
-            raise ValueError(f"message {name!r}: fields missing: {missing or 'none'}; unknown: {unknown or 'none'}")
+        if tuple(values) != kind.fields:
+            missing = [field for field in kind.fields if field not in values and field not in kind.optional]
+            unknown = [field for field in values if field not in kind.fields]
+            if missing or unknown:
+                raise ValueError(f"message {name!r}: fields missing: {missing or 'none'}; unknown: {unknown or 'none'}")
         try:
             return kind.make(values)
         except Exception as error:

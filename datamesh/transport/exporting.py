@@ -362,7 +362,7 @@ class Exporter:
     def _send(self, reader: _Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
         """Sends an event, if the reader has room; one that blocks its producer is waited for. Tells whether it did."""
         reader.number += 1
-        data = pack_event(event._replace(number=reader.number))
+        data = pack_event(event, reader.number)
         while not self._try_send(reader, data, slabs):
             if reader.socket.fileno() < 0:
                 return False

@@ -42,6 +42,8 @@ class _Connection:
         self.region = region
         self.writer = writer
         self._waiting: deque[bytes] = deque()
+        self.busy = False
+        """While a datum is being read, it is told afterwards which slabs are no longer needed."""
 
     def lease(self, slab: tuple[int, int]) -> Lease:
         """A slab, which the writer is told of when it is no longer needed."""
@@ -50,7 +52,8 @@ class _Connection:
     def _let_go(self, offset: int) -> None:
         # Called wherever the last array of a slab ends, in whatever thread: it takes no lock and never waits.
         self._waiting.append(RELEASE.pack(offset))
-        self.tell()
+        if not self.busy:
+            self.tell()
 
     def tell(self) -> None:
         """Tells the writer which slabs are no longer needed."""
@@ -207,7 +210,6 @@ class Importer:
                 return
             if not data:
                 return
-            connection.tell()
             try:
                 event = read_event(data, connection.region.size)
             except ValueError as error:
@@ -221,13 +223,17 @@ class Importer:
             if event.kind == SETTLE:
                 self._window.settle(event.version, event.epoch)
             else:
+                connection.busy = True
                 try:
                     value = _value(connection, event)
+                    publish(self._window, event, value)
+                    del value
                 except ValueError as error:
                     self._damaged(event.version, error)
                     continue
-                publish(self._window, event, value)
-                del value
+                finally:
+                    connection.busy = False
+                    connection.tell()
             self._counts["received"] += 1
             self._counts["received_bytes"] += len(data)
 
@@ -257,10 +263,11 @@ def publish(window: Window[Any], event: Event, value: Any) -> None:
         event: The commit there.
         value: Its payload.
     """
-    snapshot = window.snapshot(event.epoch)
-    index = snapshot.version_index(event.version)
-    if index >= 0 and snapshot.entry(index).committed_ns == event.committed_ns:
-        return  # sent again, after the connection was lost
+    if not event.newest:
+        snapshot = window.snapshot(event.epoch)
+        index = snapshot.version_index(event.version)
+        if index >= 0 and snapshot.entry(index).committed_ns == event.committed_ns:
+            return  # sent again, after the connection was lost
     entry = Entry(event.version, value, event.received_ns, event.committed_ns, event.epoch, event.triggers)
     policy = CommitPolicy.OVERWRITE if event.newest else CommitPolicy.INSERT_SORTED
     window.commit(policy, entry, EqualVersion.REPLACE, None if event.newest else event.triggers)

@@ -51,15 +51,15 @@ class Event(NamedTuple):
     """Of the payload there."""
 
 
-def pack_event(event: Event) -> bytes:
-    """An event as bytes."""
+def pack_event(event: Event, number: int | None = None) -> bytes:
+    """An event as bytes, under another number where one is given."""
     flags = _TRIGGERS * event.triggers | _NEWEST * event.newest | _IN_SLAB * (event.body_size > 0)
     head = _HEAD.pack(
         event.kind,
         flags,
         len(event.slabs),
         event.body_size,
-        event.number,
+        event.number if number is None else number,
         event.epoch,
         event.version,
         event.received_ns,
