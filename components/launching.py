@@ -232,7 +232,7 @@ def run_launch(
     return supervisor.run()
 
 
-def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks]:
+def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks, Sequence[str]]:
     """What a child runs, by its plan file."""
     profile = load_profile(told["profile"], {tuple(key.split(".")): v for key, v in told["profile_changes"].items()})
     use_threads(profile.content)
@@ -244,7 +244,7 @@ def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks]:
 
     links = told["links"]
     plan = LinkPlan(*(tuple(links[key]) for key in ("exports", "imports", "blocking")), links["remote"])
-    return process, Links(
+    connected = Links(
         process,
         plan,
         node=told["node"],
@@ -252,6 +252,7 @@ def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks]:
         shared_memory=SharedMemoryConfig.model_validate(told["shared_memory"]),
         zenoh=ZenohConfig.model_validate(told["zenoh"]),
     )
+    return process, connected, plan.exports
 
 
 def main() -> int:

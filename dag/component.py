@@ -44,6 +44,9 @@ class Component:
     Config: ClassVar[type[BaseModel]] = ProcessorConfig
     """The model of its configuration; a subclass names its own."""
 
+    takes_any_input: ClassVar[bool] = False
+    """Whether the configuration may map inputs that the class does not declare, of any names and types."""
+
     def __init__(self, name: str, context: Any = None) -> None:
         """Makes an unbound component.
 

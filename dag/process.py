@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
-from ..datamesh import DataMesh
+from ..datamesh import DataMesh, Input
 from ..errors import ConfigError
 from .backlog import BacklogConfig
 from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
@@ -97,6 +97,9 @@ class Process:
                 raise file.error(
                     [*keys, "outputs", name], f"there is an input {name!r} too: give the output a name of its own"
                 )
+        if component.takes_any_input:
+            for name in spec.inputs:
+                component.inputs.setdefault(name, Input())
         if isinstance(component, DagComponent):
             component.add_handles(list(spec.inputs), list(spec.outputs))
             vertices = declare_vertices(file, keys, spec)

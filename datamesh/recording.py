@@ -152,6 +152,7 @@ class Recorder:
         metadata: Mapping[str, str] | None = None,
         attachments: Mapping[str, bytes] | None = None,
         digest_only: Iterable[str] = (),
+        write_through: bool = False,
     ) -> None:
         """Creates the file, and its folder where there is none; a file of that name is replaced.
 
@@ -162,6 +163,8 @@ class Recorder:
             metadata: What is said of the recording, as the MCAP record `warploom`.
             attachments: Files kept in the recording, such as the modules that ran, by name.
             digest_only: Topics of which only the hashes are kept: enough to verify a replay.
+            write_through: Every event is given to the system as soon as its turn comes, and not collected in chunks: a
+                process that is killed loses what waits in the queue and no more. Nothing is compressed then.
 
         Raises:
             ValueError: compression or when_full is none of these.
@@ -192,17 +195,19 @@ class Recorder:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = _File(self.path)
-            self._open(compression, metadata or {}, attachments or {})
+            self._open(compression, metadata or {}, attachments or {}, write_through)
         except OSError as error:
             raise SinkError(f"{self.path}: cannot be created: {error.strerror or error}") from None
         self._thread = threading.Thread(target=self._run, name=f"recorder {self.path.name}", daemon=True)
         self._thread.start()
 
-    def _open(self, compression: str, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> None:
+    def _open(
+        self, compression: str, metadata: Mapping[str, str], attachments: Mapping[str, bytes], write_through: bool
+    ) -> None:
         from mcap.writer import CompressionType, Writer
 
         kind = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}[compression]
-        self._writer = Writer(self._file, compression=kind)  # type: ignore[arg-type]
+        self._writer = Writer(self._file, compression=kind, use_chunking=not write_through)  # type: ignore[arg-type]
         self._writer.start(profile="warploom", library="warploom")
         self._writer.add_metadata("warploom", dict(metadata))
         for name, data in attachments.items():

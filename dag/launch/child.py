@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ...errors import WarploomError
@@ -143,11 +143,11 @@ class Child:
             return {"error": f"{type(error).__name__}: {error}"}
         return {"ok": True}
 
-    def run(self, build: Callable[[], tuple[Process, ProcessLinks]]) -> int:
+    def run(self, build: Callable[[], tuple[Process, ProcessLinks, Sequence[str]]]) -> int:
         """Builds the process, runs it from the order to start to the order to stop.
 
         Args:
-            build: Makes the process and its links, neither started.
+            build: Makes the process and its links, neither started, and names the topics that it exports.
 
         Returns:
             The exit code: 0 after a stop, `CONFIGURATION` where what was to be built is wrong, 1 where it broke.
@@ -157,7 +157,7 @@ class Child:
             self._channel.send({"report": "warning", "message": warning})
         try:
             self._building = True
-            process, links = build()
+            process, links, exports = build()
             self._building = False
         except SystemExit:
             return 0
@@ -175,12 +175,15 @@ class Child:
         if self._orders.get() != "start":
             return 0
         try:
-            links.start()
+            for topic in exports:  # nothing that the process commits is missed
+                links.export(topic)
             process.start()
+            links.start()  # the imports: what comes finds who reads it
         except BaseException as error:
             traceback.print_exc()
             self._channel.send({"report": "broke", "error": f"{type(error).__name__}: {error}"})
             with contextlib.suppress(Exception):
+                process.stop()
                 links.stop()
             return 1
         self._links = links
