@@ -1,5 +1,8 @@
 """Profiles: all that ship are good, what they change, and how mistakes are told."""
 
+import subprocess
+import sys
+
 import pytest
 
 from warploom.components import profile as profiles
@@ -147,3 +150,23 @@ def test_the_threads_of_kernels_are_set_only_where_it_says_so():
         assert threads.thread_count() == 3
     finally:
         threads.set_thread_count(before)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in KiB on Linux")
+def test_cpu_min_runs_the_demo_within_a_gibibyte(tmp_path):
+    """In a process of its own: its peak of resident memory, kernels compiled in it where there is no cache."""
+    code = f"""
+import resource, sys
+from warploom.cli import main
+sys.argv = ["warploom", "demo", "--profile", "cpu-min", "--seconds", "3", "--out", {str(tmp_path / "out")!r}]
+try:
+    main()
+except SystemExit as ended:
+    assert not ended.code
+sys.stderr.write(f"PEAK {{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}}")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    peak = int(done.stderr.rpartition("PEAK ")[2]) / 1024
+    assert peak <= 1024, f"{peak:.0f} MiB"
