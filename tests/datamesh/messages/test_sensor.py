@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -87,6 +87,7 @@ layouts = st.lists(st.tuples(number, st.integers(1, 3)), min_size=1, max_size=5)
 )
 
 
+@settings(deadline=None)
 @given(st.data(), layouts, st.sampled_from("<>"), st.booleans())
 def test_any_structured_array_comes_back(data, layout, order, aligned):
     kind = np.dtype(layout, align=aligned).newbyteorder(order)

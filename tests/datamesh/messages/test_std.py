@@ -95,7 +95,7 @@ def test_the_fields_are_those_of_ros():
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_every_message_comes_back_from_its_bytes(kind, data):
     one = data.draw(of_kind(kind))
