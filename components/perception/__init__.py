@@ -6,6 +6,7 @@ from .cluster_boxes import ClusterBoxProcessor
 from .clustering import ClusterProcessor
 from .detection import DetectionProcessor
 from .filtering import FilterProcessor
+from .fusion import FusionProcessor
 from .ground import GroundProcessor
 from .merging import MergeProcessor
 from .point_labels import PointLabelsProcessor
@@ -18,6 +19,7 @@ __all__ = [
     "ClusterProcessor",
     "DetectionProcessor",
     "FilterProcessor",
+    "FusionProcessor",
     "GroundProcessor",
     "MergeProcessor",
     "PointLabelsProcessor",

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from ...dag import ConfigFile, ProcessorConfig, find_config, parse_overrides
 from ...models.classes import CLASSES
@@ -53,6 +53,11 @@ class TrackerSettings(ProcessorConfig):
     """More in one frame are dropped, those of lowest score."""
     max_tracks: int | None = Field(None, ge=1)
     """No track is begun beyond."""
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> TrackerSettings:
+        self.tracker_config()
+        return self
 
     def tracker_config(self) -> TrackerConfig:
         """The tracker's configuration with these settings in place."""
