@@ -6,7 +6,7 @@ from .frame import SimulatedFrame
 from .labels import GROUND_CLASSES, PointClass
 from .radar import Radar, RadarFrame
 from .scenarios import SCENARIOS
-from .scenes import SceneBatch, sample_scene
+from .scenes import SceneBatch, sample_scene, sample_views
 from .sensors import LIDARS, Lidar, lidar_model
 from .simulator import Simulator
 from .sweep import compensated
@@ -31,4 +31,5 @@ __all__ = [
     "lidar_model",
     "local_from_geodetic",
     "sample_scene",
+    "sample_views",
 ]

@@ -57,7 +57,7 @@ class Prototype:
 
     shape: Shape
     hull: np.ndarray
-    """The corners that its bounding box can touch, shape (h, 3)."""
+    """The corners that its bounding box can touch while it and the sensor lean by up to 0.25 rad, shape (h, 3)."""
     size: np.ndarray
     """Length, width, height of its bounding box [m], shape (3,)."""
     surface: np.ndarray
@@ -98,9 +98,12 @@ def prototype(kind: str, variant: int, phase: int = 0) -> Prototype:
 
 
 def _hull(vertices: np.ndarray) -> np.ndarray:
-    from scipy.spatial import ConvexHull
-
-    return vertices[ConvexHull(vertices).vertices]
+    """The vertices that are the farthest in any of the directions that a side of the box can face."""
+    lean = np.linspace(-0.25, 0.25, 13)  # at 0.04 rad a corner in between stands out by less than a millimetre
+    u, v = (grid.ravel() for grid in np.meshgrid(lean, lean))
+    one = np.ones_like(u)
+    ways = np.concatenate([np.roll(np.stack([sign * one, u, v], 1), axis, 1) for axis in range(3) for sign in (1, -1)])
+    return vertices[np.unique((vertices @ ways.T).argmax(0))]
 
 
 def _surface(shape: Shape) -> np.ndarray:

@@ -19,7 +19,7 @@ from .street import STYLES, Street, random_street
 from .sweep import START_NS, caster, observe, read_frame, set_scene
 from .world import World, place
 
-__all__ = ["SceneBatch", "sample_scene"]
+__all__ = ["SceneBatch", "sample_scene", "sample_views"]
 
 _PERIOD = 0.1  # [s]
 _DRAWN = ("vlp16", "hdl32", "vlp32", "xt32", "pandar40", "hdl64", "pandar64", "pandar90", "vls128", "os1_128")
@@ -104,7 +104,68 @@ def sample_scene(
     random = np.random.default_rng([seed, 11])
     drawn = _drawn_lidar(random)
     model = lidar if isinstance(lidar, Lidar) else lidar_model(lidar) if lidar else drawn
-    device = resolve_device(device)
+    library, cast = _kept(model, rain, resolve_device(device))
+    scene = _draw(random, mounting_height, turning)
+    return observe(
+        World(scene.street, library), cast, model, scene.pose_at, 0.0, turn=_PERIOD if turning else 0.0, seed=seed,
+        index=0, version=START_NS, visibility=visibility,
+    )  # fmt: skip
+
+
+def sample_views(
+    seed: int, count: int, lidar: str | Lidar | None = None, *, device: str = "cpu"
+) -> list[SimulatedFrame]:
+    """Sweeps of one random scene, in an instant each, from `count` places at different times.
+
+    The first is that of `sample_scene`; the others are from free places elsewhere on the street, each with a heading,
+    a mounting and a sensor of its own.
+
+    Args:
+        seed: Any integer ≥ 0.
+        count: How many.
+        lidar: A sensor or its name; None draws one for each.
+        device: Where rays are cast.
+    """
+    random = np.random.default_rng([seed, 11])
+    drawn, device = _drawn_lidar(random), resolve_device(device)
+    scene = _draw(random, None, False)
+    world, frames = None, []
+    random = np.random.default_rng([seed, 12])
+    pose_at = scene.pose_at
+    for view in range(count):
+        model = lidar if isinstance(lidar, Lidar) else lidar_model(lidar) if lidar else drawn
+        library, cast = _kept(model, 0.0, device)
+        if world is None:
+            world = World(scene.street, library)
+        frames.append(
+            observe(
+                world, cast, model, pose_at, 1.5 * view, turn=0.0, seed=seed + 1_000_003 * view, index=view,
+                version=START_NS + view * 1_500_000_000, visibility=False,
+            )
+        )  # fmt: skip
+        drawn = _drawn_lidar(random)
+        pose_at = _elsewhere(random, scene.street, world, 1.5 * (view + 1))
+    return frames
+
+
+def _elsewhere(random: np.random.Generator, street: Street, world: World, t: float) -> Callable[[float], np.ndarray]:
+    """A pose at rest on the carriageway or beside it, 2.5 m from the middle of all that is there at time t."""
+    which = np.arange(len(world))
+    s_all, d_all, _ = world.street_pose(which, t)
+    s = d = 0.0
+    for _ in range(40):
+        s, d = random.uniform(-45, 45), random.normal(0, 4)
+        if np.hypot(s_all - s, d_all - d).min() > 2.5 and street.free(s, d, 1.2):
+            break
+    heading = random.choice([0.0, np.pi]) + random.normal(0, 0.3)
+    mount = mounting(random.uniform(1.4, 2.3), random.normal(0, 0.012), random.normal(0, 0.01))
+    one = np.ones(1)
+    pose = place(street.ground, s * one, d * one, heading * one, 0 * one, np.ones((1, 3)), np.zeros(1, bool))[0] @ mount
+    return lambda _: pose
+
+
+def _kept(model: Lidar, rain: float, device: str) -> tuple[Library, LidarCast]:
+    """The library and the plan of a sensor that this thread keeps from scene to scene."""
     kept = _workshop.__dict__.setdefault("kept", {})
     if device not in kept:
         kept[device] = (Library(device), {})
@@ -115,11 +176,7 @@ def sample_scene(
         casts[key] = (caster(library, model, _PERIOD, wetness=wetness), model)
     cast: LidarCast = casts[key][0]
     cast.set_rain(rain)
-    scene = _draw(random, mounting_height, turning)
-    return observe(
-        World(scene.street, library), cast, model, scene.pose_at, 0.0, turn=_PERIOD if turning else 0.0, seed=seed,
-        index=0, version=START_NS, visibility=visibility,
-    )  # fmt: skip
+    return library, cast
 
 
 class SceneBatch:

@@ -81,6 +81,10 @@ class Street:
                         return False
         return True
 
+    def free(self, s: float, d: float, radius: float) -> bool:
+        """Whether nothing stands within a radius of at most 2.5 m of a place."""
+        return self._free([(s, d, radius)])
+
     def block(self, s: float, d: float, radius: float) -> None:
         """Keeps a place of at most 2.5 m radius free [m]."""
         cell = (math.floor(s / _CELL), math.floor(d / _CELL))

@@ -19,7 +19,11 @@ def main(
     seed: Annotated[int, typer.Option(help="Of weights, draws and variations.")] = 0,
     minutes: Annotated[float | None, typer.Option(help="Train this long.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Train this far instead: reproducible to the bit.")] = None,
-    frames: Annotated[int, typer.Option(help="Simulated scenes to learn from.")] = 2000,
+    frames: Annotated[int, typer.Option(help="Simulated scans to learn from.")] = 2000,
+    views: Annotated[int, typer.Option(help="Scans of each simulated street: more cost less time a scan.")] = 1,
+    stem: Annotated[int, typer.Option(help="Channels of the network at 0.5 m.")] = 24,
+    lean: Annotated[bool, typer.Option("--lean", help="Look at 16 of the 20 pillar channels.")] = False,
+    extra: Annotated[list[str] | None, typer.Option(help="Also learn iou, vx or vy; they are not exported.")] = None,
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
     start_from: Annotated[Path | None, typer.Option(help="Begin with the weights of this checkpoint.")] = None,
     learning_rate: Annotated[float, typer.Option(help="The highest of the cycle.")] = 3e-3,
@@ -28,8 +32,10 @@ def main(
     workers_nice: Annotated[int, typer.Option(help="How far those stand back for other processes.")] = 10,
 ) -> None:
     """Trains a pillar centre head on simulated scenes; interrupted, the same command goes on."""
+    from ...kernels.pillar import pillar_channels
     from .export import export_head
     from .loop import TrainingConfig, described, train
+    from .network import LEAN_CHANNELS
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if minutes is None and iterations is None:
@@ -40,6 +46,10 @@ def main(
         minutes=minutes,
         iterations=iterations,
         frames=frames,
+        views=views,
+        width=(stem, 48, 128),
+        channels=LEAN_CHANNELS if lean else pillar_channels(),
+        extras=tuple(extra or ()),
         frames_folder=frames_folder,
         start_from=start_from,
         learning_rate=learning_rate,

@@ -6,13 +6,13 @@ A frame file holds points in steps of 2 mm (int16), so that 2,000 scans take 1.5
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Augmentation", "TrainingFrame", "augment", "load_frame", "save_frame", "simulate_frame"]
+__all__ = ["Augmentation", "TrainingFrame", "augment", "load_frame", "save_frame", "simulate_frame", "simulate_views"]
 
 _STEP = 0.002  # [m]
 _REACH = 32767 * _STEP
@@ -34,6 +34,8 @@ class TrainingFrame:
     """Points that each object returned, shape (k,), int32."""
     sensor_height: float
     """Above the ground around the sensor [m]."""
+    velocities: np.ndarray = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    """Over ground along x and y [m/s], shape (k, 2), float32; of no rows where they are unknown."""
 
 
 class _Simulated(Protocol):
@@ -43,6 +45,7 @@ class _Simulated(Protocol):
     boxes: np.ndarray
     classes: np.ndarray
     counts: np.ndarray
+    velocities: np.ndarray
 
 
 def height_over_ground(points: np.ndarray, ground: np.ndarray, radius: float = 12.0) -> float:
@@ -59,6 +62,16 @@ def simulate_frame(seed: int) -> TrainingFrame:
     return _training_frame(frame)
 
 
+def simulate_views(seed: int, count: int) -> list[TrainingFrame]:
+    """`count` scans of the street of this seed, from different places with random sensors.
+
+    Most of the time of a scene goes into building its street, so that views of one cost a fraction of as many streets.
+    """
+    from ..simulator import sample_views
+
+    return [_training_frame(frame) for frame in sample_views(seed, count)]
+
+
 def _training_frame(frame: _Simulated) -> TrainingFrame:
     inside = (np.abs(frame.points[:, :3]) < _REACH).all(axis=1)
     points = frame.points[inside]
@@ -69,6 +82,7 @@ def _training_frame(frame: _Simulated) -> TrainingFrame:
         classes=np.asarray(frame.classes, np.int32),
         points_in=np.asarray(frame.counts, np.int32),
         sensor_height=height_over_ground(points, np.asarray(frame.ground, bool)[inside]),
+        velocities=np.asarray(frame.velocities, np.float32).reshape(-1, 2),
     )
 
 
@@ -83,6 +97,7 @@ def save_frame(path: Path, frame: TrainingFrame) -> None:
         classes=frame.classes,
         points_in=frame.points_in,
         sensor_height=np.float32(frame.sensor_height),
+        velocities=frame.velocities,
     )
     os.replace(partial, path)
 
@@ -97,6 +112,7 @@ def load_frame(path: Path) -> TrainingFrame:
             classes=stored["classes"],
             points_in=stored["points_in"],
             sensor_height=float(stored["sensor_height"]),
+            velocities=stored["velocities"] if "velocities" in stored else np.empty((0, 2), np.float32),
         )
 
 
@@ -153,4 +169,5 @@ def augment(frame: TrainingFrame, rng: np.random.Generator, options: Augmentatio
         classes=frame.classes,
         points_in=np.floor(frame.points_in * share).astype(np.int32),
         sensor_height=rng.uniform(-options.height, options.height),
+        velocities=frame.velocities @ (matrix[:2, :2] / np.float32(scale)).T,
     )

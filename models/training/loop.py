@@ -15,10 +15,18 @@ import numpy as np
 import torch
 import warp as wp
 
-from ...kernels.pillar import PillarGrid
-from .frames import Augmentation, TrainingFrame, augment, load_frame, save_frame, simulate_frame
+from ...kernels.pillar import PillarGrid, pillar_channels
+from .frames import (
+    Augmentation,
+    TrainingFrame,
+    augment,
+    load_frame,
+    save_frame,
+    simulate_frame,
+    simulate_views,
+)
 from .network import STRIDE, PillarCenterNet
-from .targets import draw_targets, loss
+from .targets import draw_targets, extra_loss, loss
 
 __all__ = ["TrainingConfig", "TrainingResult", "make_frames", "train"]
 
@@ -40,7 +48,9 @@ class TrainingConfig:
     iterations: int | None = None
     """Stop after so many steps; all frames are made first. Exactly one of the two is given."""
     frames: int = 2000
-    """Simulated scenes."""
+    """Simulated scans."""
+    views: int = 1
+    """Scans of each simulated street: more cost less time a scan, and are less unlike each other."""
     frames_folder: Path | None = None
     """Where they are kept, and found again by the next training; None is `out`/frames."""
     batch: int = 4
@@ -49,6 +59,10 @@ class TrainingConfig:
     cell: float = 0.25
     width: tuple[int, int, int] = (24, 48, 128)
     depth: tuple[int, int] = (1, 1)
+    channels: tuple[str, ...] = pillar_channels()
+    """What the network looks at, of these; `network.LEAN_CHANNELS` are 16 of them."""
+    extras: tuple[str, ...] = ()
+    """What a further branch learns, of `network.EXTRAS`."""
     learning_rate: float = 3e-3
     weight_decay: float = 0.01
     average: float = 0.998
@@ -66,6 +80,8 @@ class TrainingConfig:
         if (self.minutes is None) == (self.iterations is None):
             raise ValueError("give either minutes or iterations, not both and not neither")
         cells = 2.0 * self.window / self.cell
+        if self.views < 1:
+            raise ValueError(f"views must be at least 1, not {self.views}")
         if cells != round(cells) or round(cells) % (4 * STRIDE):
             raise ValueError(f"2 · window / cell must be a multiple of {4 * STRIDE}, not {cells}")
 
@@ -73,6 +89,13 @@ class TrainingConfig:
     def folder(self) -> Path:
         """Where the frames are."""
         return self.frames_folder or self.out / "frames"
+
+    def frame_path(self, number: int) -> Path:
+        """The file of a scan, by its number from 0."""
+        if self.views == 1:
+            return self.folder / f"{_FIRST_TRAINING_SEED + number}.npz"
+        street, view = divmod(number, self.views)
+        return self.folder / f"{_FIRST_TRAINING_SEED + street}-{view}of{self.views}.npz"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +125,21 @@ def make_frames(
             save_frame(path, simulate(seed))
 
 
+def make_views(folder: Path, seeds: range, views: int, nice: int = 0) -> None:
+    """Simulates the streets of these seeds, so many scans of each, that are not all in the folder yet."""
+    if nice:
+        os.nice(nice)
+    folder.mkdir(parents=True, exist_ok=True)
+    parent = multiprocessing.parent_process()
+    for seed in seeds:
+        if parent is not None and not parent.is_alive():
+            return
+        paths = [folder / f"{seed}-{view}of{views}.npz" for view in range(views)]
+        if not all(path.exists() for path in paths):
+            for path, frame in zip(paths, simulate_views(seed, views), strict=True):
+                save_frame(path, frame)
+
+
 def _sample(
     frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
@@ -119,8 +157,10 @@ def _sample(
         config.cell * STRIDE,
         (edge, edge),
         ground=-varied.sensor_height,
+        velocities=varied.velocities,
     )
-    return grid.grid.numpy()[0].copy(), targets.heat, targets.mask, targets.values, targets.weight
+    maps = (targets.heat, targets.mask, targets.values, targets.weight, targets.velocity)
+    return grid.grid.numpy()[0].copy(), *maps
 
 
 def _batches(config: TrainingConfig, paths: Callable[[], list[Path]], start: int) -> Iterator[list[torch.Tensor]]:
@@ -160,12 +200,14 @@ def _running_average(decay: float) -> Callable[[torch.Tensor, torch.Tensor, int]
 
 def _start_workers(config: TrainingConfig) -> list[multiprocessing.Process]:
     context = multiprocessing.get_context("spawn")
-    seeds = range(_FIRST_TRAINING_SEED, _FIRST_TRAINING_SEED + config.frames)
+    streets = -(-config.frames // config.views)
+    seeds = range(_FIRST_TRAINING_SEED, _FIRST_TRAINING_SEED + streets)
     started = []
     for k in range(config.workers):
+        mine = seeds[k :: config.workers]
         process = context.Process(
-            target=make_frames,
-            args=(config.folder, seeds[k :: config.workers]),
+            target=make_frames if config.views == 1 else make_views,
+            args=(config.folder, mine) if config.views == 1 else (config.folder, mine, config.views),
             kwargs={"nice": config.workers_nice},
             daemon=True,
         )
@@ -182,8 +224,7 @@ def _frames_there(config: TrainingConfig) -> Callable[..., list[Path]]:
     def look(now: bool = False) -> list[Path]:
         nonlocal known, looked
         if len(known) < config.frames and (now or time.monotonic() - looked > 5.0):
-            names = (config.folder / f"{_FIRST_TRAINING_SEED + k}.npz" for k in range(config.frames))
-            known = [path for path in names if path.exists()]
+            known = [path for path in map(config.frame_path, range(config.frames)) if path.exists()]
             looked = time.monotonic()
         return known
 
@@ -199,7 +240,9 @@ def train(config: TrainingConfig) -> TrainingResult:
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     config.out.mkdir(parents=True, exist_ok=True)
-    network = PillarCenterNet(config.width, config.depth).to(memory_format=torch.channels_last)
+    network = PillarCenterNet(config.width, config.depth, config.channels, config.extras).to(
+        memory_format=torch.channels_last
+    )
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_running_average(config.average), use_buffers=True)
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     checkpoint = config.out / "checkpoint.pt"
@@ -254,8 +297,11 @@ def train(config: TrainingConfig) -> TrainingResult:
             group["lr"] = _rate(progress, config.learning_rate)
         pillars = batch[0].contiguous(memory_format=torch.channels_last)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            maps = network(pillars)
-        total, parts = loss(maps, *batch[1:])
+            maps, said = network.forward_all(pillars)
+        total, parts = loss(maps, *batch[1:5])
+        if said is not None:
+            more, further = extra_loss(config.extras, said, maps, *batch[3:])
+            total, parts = total + 0.2 * more, parts | further
         optimiser.zero_grad(set_to_none=True)
         total.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
@@ -265,13 +311,10 @@ def train(config: TrainingConfig) -> TrainingResult:
         for name, value in parts.items():
             running[name] = 0.98 * running.get(name, value) + 0.02 * value
         if iteration % 50 == 0:
+            losses = ", ".join(f"{name} {value:.3f}" for name, value in running.items())
+            left = (1.0 - progress) * minutes / progress if progress else float("nan")
             _log.info(
-                "minute %.1f, iteration %d, %d frames: heat %.3f, box %.3f",
-                minutes,
-                iteration,
-                len(there()),
-                running["heat"],
-                running["box"],
+                "minute %.1f, %.1f left, iteration %d, %d frames: %s", minutes, left, iteration, len(there()), losses
             )
         if time.monotonic() - last_saved > 120.0:
             save()
@@ -291,8 +334,12 @@ def train(config: TrainingConfig) -> TrainingResult:
 
 def described(config: TrainingConfig, result: TrainingResult) -> dict[str, object]:
     """What a card says of a training."""
-    names = ("batch", "window", "cell", "width", "depth", "learning_rate", "weight_decay", "average")
+    names = ("batch", "window", "cell", "width", "depth", "views", "learning_rate", "weight_decay", "average")
     recipe = {name: getattr(config, name) for name in names} | {"augmentation": asdict(config.augmentation)}
+    if config.channels != pillar_channels():
+        recipe["channels"] = list(config.channels)
+    if config.extras:
+        recipe["extras"] = list(config.extras)
     return {
         "data": "scenes of warploom's simulator alone",
         "seed": config.seed,

@@ -12,7 +12,7 @@ from torch import nn
 
 from ...kernels.pillar import pillar_channels
 
-__all__ = ["HEAD_CLASSES", "REGRESSION", "STRIDE", "UNFOLD", "PillarCenterNet"]
+__all__ = ["EXTRAS", "HEAD_CLASSES", "LEAN_CHANNELS", "REGRESSION", "STRIDE", "UNFOLD", "PillarCenterNet"]
 
 HEAD_CLASSES = ("vehicle", "pedestrian", "cyclist", "cone", "barrier")
 """Classes of the heat maps, which are the first channels of the output."""
@@ -20,6 +20,13 @@ HEAD_CLASSES = ("vehicle", "pedestrian", "cyclist", "cone", "barrier")
 REGRESSION = ("dx", "dy", "z", "log_l", "log_w", "log_h", "cos_2yaw", "sin_2yaw", "cos_yaw", "sin_yaw")
 """The channels after the heat maps: offset from the cell's centre [cells], centre above ground [m], log sizes, and
 the heading twice: of the axis, which is never ambiguous, and of the object, which only chooses the axis's sign."""
+
+EXTRAS = ("iou", "vx", "vy")
+"""What a further branch can say of each cell: how well the box there fits, as twice its overlap less one (CIA-SSD,
+Zheng et al. 2021), and the velocity over ground along the grid's axes [10 m/s]."""
+
+LEAN_CHANNELS = (*pillar_channels()[:11], *pillar_channels()[-5:])
+"""16 of the 20 channels: without the height slices above 2.5 m, of which the highest z tells as well."""
 
 STRIDE = 2
 """Input cells along an edge of an output cell."""
@@ -56,13 +63,27 @@ class PillarCenterNet(nn.Module):
     Args:
         width: Channels at 0.5, 1 and 2 m.
         depth: Residual blocks at 1 and 2 m.
+        channels: The pillar channels that it looks at, of those of `pillar_channels`, which it is given all.
+        extras: Of `EXTRAS`, what the further branch says; it is not exported.
     """
 
-    def __init__(self, width: tuple[int, int, int] = (24, 48, 128), depth: tuple[int, int] = (1, 1)):
+    def __init__(
+        self,
+        width: tuple[int, int, int] = (24, 48, 128),
+        depth: tuple[int, int] = (1, 1),
+        channels: tuple[str, ...] = pillar_channels(),
+        extras: tuple[str, ...] = (),
+    ):
         super().__init__()
+        there = pillar_channels()
+        for name, said, known in (("channels", channels, there), ("extras", extras, EXTRAS)):
+            if unknown := [one for one in said if one not in known]:
+                raise ValueError(f"{name} must be of {', '.join(known)}, not {', '.join(unknown)}")
         fine, middle, coarse = width
         outputs = len(HEAD_CLASSES) + len(REGRESSION)
-        self.stem = _convolution(len(pillar_channels()), fine, stride=2)
+        self.extras = tuple(extras)
+        self._chosen = None if channels == there else [there.index(name) for name in channels]
+        self.stem = _convolution(len(channels), fine, stride=2)
         self.down1 = nn.Sequential(_convolution(fine, middle, stride=2), *(_Residual(middle) for _ in range(depth[0])))
         self.down2 = nn.Sequential(
             _convolution(middle, coarse, stride=2), *(_Residual(coarse) for _ in range(depth[1]))
@@ -77,10 +98,22 @@ class PillarCenterNet(nn.Module):
         nn.init.zeros_(self.head.bias)
         with torch.no_grad():
             self.head.bias[: len(HEAD_CLASSES) * UNFOLD**2] = -4.6
+        # Made last, so that a seed gives the same weights with and without it.
+        self.extra = nn.Sequential(
+            _convolution(middle, middle), nn.Conv2d(middle, len(extras) * UNFOLD**2, 1), nn.PixelShuffle(UNFOLD)
+        ) if extras else None  # fmt: skip
+
+    def _features(self, pillars: torch.Tensor) -> torch.Tensor:
+        half = self.stem(pillars if self._chosen is None else pillars[:, self._chosen])
+        one = self.down1(half)
+        two = self.down2(one)
+        return self.merge(one + self.up(self.lateral(two)))
 
     def forward(self, pillars: torch.Tensor) -> torch.Tensor:
         """The maps of a batch of pillars."""
-        half = self.stem(pillars)
-        one = self.down1(half)
-        two = self.down2(one)
-        return self.unfold(self.head(self.merge(one + self.up(self.lateral(two)))))
+        return self.unfold(self.head(self._features(pillars)))
+
+    def forward_all(self, pillars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """The maps, and those of the further branch, shape (n, extras, H / 2, W / 2), None without one."""
+        features = self._features(pillars)
+        return self.unfold(self.head(features)), None if self.extra is None else self.extra(features)

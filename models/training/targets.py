@@ -10,14 +10,16 @@ from torch.nn import functional
 
 from .network import HEAD_CLASSES, REGRESSION
 
-__all__ = ["Targets", "draw_targets", "loss"]
+__all__ = ["Targets", "draw_targets", "extra_loss", "loss", "overlap"]
 
+_CELL = 0.5  # [m] edge of an output cell
 # An object with fewer returns is neither asked for nor counted as false.
 _FEWEST_POINTS = np.array([5, 4, 4, 3, 4])
 # Spread of a peak [output cells]: about a third of the object's narrow side, never less than a cell needs.
 _LEAST_SPREAD = 0.7
 # Cells round the centre that learn the box too, so that a peak one cell off still gives a good one.
 _NEIGHBOURHOOD = 1
+_SPEED = 10.0  # [m/s] of a velocity of 1 in the maps
 _WEIGHTS = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.3, 0.3])
 
 
@@ -33,6 +35,8 @@ class Targets:
     """Shape (regression, H, W), float32."""
     weight: np.ndarray
     """Shape (H, W), float32: 0 where there is no box to learn."""
+    velocity: np.ndarray
+    """Over ground along the grid's axes [10 m/s], shape (2, H, W), float32; NaN where it is unknown."""
 
 
 def draw_targets(
@@ -43,6 +47,7 @@ def draw_targets(
     cell: float,
     shape: tuple[int, int],
     ground: float = 0.0,
+    velocities: np.ndarray | None = None,
 ) -> Targets:
     """Draws the maps of one frame.
 
@@ -54,12 +59,15 @@ def draw_targets(
         cell: Edge of an output cell [m].
         shape: H, W.
         ground: Height of the ground in the frame of the boxes, as the network is told [m].
+        velocities: Of the objects along the grid's axes [m/s], shape (k, 2); None or of no rows: unknown.
     """
     height, width = shape
     heat = np.zeros((len(HEAD_CLASSES), height, width), np.float32)
     mask = np.ones_like(heat)
     values = np.zeros((len(REGRESSION), height, width), np.float32)
     weight = np.zeros((height, width), np.float32)
+    velocity = np.full((2, height, width), np.nan, np.float32)
+    known = velocities is not None and len(velocities) == len(boxes)
     u = (boxes[:, 0] - origin[0]) / cell
     v = (boxes[:, 1] - origin[1]) / cell
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & (classes < len(HEAD_CLASSES))
@@ -89,7 +97,9 @@ def draw_targets(
                 if own >= weight[r, c]:
                     values[:, r, c] = [u[k] - c - 0.5, v[k] - r - 0.5, *fixed]
                     weight[r, c] = own
-    return Targets(heat=heat, mask=mask, values=values, weight=weight)
+                    if known:
+                        velocity[:, r, c] = velocities[k] / _SPEED
+    return Targets(heat=heat, mask=mask, values=values, weight=weight, velocity=velocity)
 
 
 def loss(
@@ -118,3 +128,52 @@ def loss(
     scale = _WEIGHTS.to(boxes)[None, :, None, None] * weight[:, None]
     box = ((boxes - values).abs() * scale).sum() / weight.sum().clamp(min=1.0)
     return focal + 0.5 * box, {"heat": float(focal.detach()), "box": float(box.detach())}
+
+
+def overlap(boxes: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """How far predicted boxes overlap the true ones, both as regression maps of shape (n, regression, H, W).
+
+    The intersection over union of the two solids as if both had the true heading, times |cos| of the angle between
+    their axes: exact where the headings agree, and cheap. Cells are 0.5 m wide.
+    """
+    half = 0.5 * torch.atan2(values[:, 7], values[:, 6])
+    c, s = torch.cos(half), torch.sin(half)
+    dx, dy = (_CELL * (boxes[:, k] - values[:, k]) for k in (0, 1))
+    apart = torch.stack([dx * c + dy * s, dy * c - dx * s, boxes[:, 2] - values[:, 2]], 1).abs()
+    size, true = boxes[:, 3:6].clamp(-4.0, 4.0).exp(), values[:, 3:6].exp()
+    common = (torch.minimum(0.5 * size + 0.5 * true - apart, torch.minimum(size, true))).clamp(min=0.0).prod(1)
+    union = size.prod(1) + true.prod(1) - common
+    turned = torch.atan2(boxes[:, 7], boxes[:, 6]) - torch.atan2(values[:, 7], values[:, 6])
+    return common / union.clamp(min=1e-6) * torch.cos(0.5 * turned).abs()
+
+
+def extra_loss(
+    extras: tuple[str, ...],
+    said: torch.Tensor,
+    maps: torch.Tensor,
+    values: torch.Tensor,
+    weight: torch.Tensor,
+    velocity: torch.Tensor,
+) -> tuple[torch.Tensor, dict[str, float]]:
+    """L1 of the further branch: of the overlap that the boxes really have, and of velocities where they are known.
+
+    Args:
+        extras: What the branch says, of `network.EXTRAS`.
+        said: Its maps, shape (n, extras, H, W).
+        maps: As in `loss`, as are values and weight.
+        values: Shape (n, regression, H, W).
+        weight: Shape (n, H, W).
+        velocity: Shape (n, 2, H, W), NaN where unknown.
+    """
+    said, total, parts = said.float(), maps.new_zeros((), dtype=torch.float32), {}
+    for k, name in enumerate(extras):
+        if name == "iou":
+            with torch.no_grad():
+                wanted = 2.0 * overlap(maps[:, len(HEAD_CLASSES) :].float(), values) - 1.0
+        else:
+            wanted = velocity[:, 0 if name == "vx" else 1]
+        known = weight * torch.isfinite(wanted)
+        off = ((said[:, k] - torch.nan_to_num(wanted)).abs() * known).sum() / known.sum().clamp(min=1.0)
+        total = total + off
+        parts[name] = float(off.detach())
+    return total, parts

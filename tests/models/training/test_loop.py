@@ -9,10 +9,17 @@ import torch
 from warploom.models.card import load_card
 from warploom.models.head import DetectionHead
 from warploom.models.training.export import export_head
-from warploom.models.training.frames import Augmentation, TrainingFrame, augment, load_frame, save_frame
-from warploom.models.training.loop import TrainingConfig, described, make_frames, train
-from warploom.models.training.network import HEAD_CLASSES, REGRESSION, PillarCenterNet
-from warploom.models.training.targets import draw_targets, loss
+from warploom.models.training.frames import (
+    Augmentation,
+    TrainingFrame,
+    augment,
+    load_frame,
+    save_frame,
+    simulate_frame,
+)
+from warploom.models.training.loop import TrainingConfig, described, make_frames, make_views, train
+from warploom.models.training.network import EXTRAS, HEAD_CLASSES, LEAN_CHANNELS, REGRESSION, PillarCenterNet
+from warploom.models.training.targets import draw_targets, loss, overlap
 
 FIRST = 1_000_000
 
@@ -42,6 +49,7 @@ def scene(seed, reach=9.0):
         classes=np.zeros(k, np.int32),
         points_in=np.full(k, 80, np.int32),
         sensor_height=1.7,
+        velocities=rng.normal(0, 5, (k, 2)).astype(np.float32),
     )
 
 
@@ -52,7 +60,7 @@ def frames_folder(tmp_path_factory):
     return folder
 
 
-def config(out, frames_folder, iterations):
+def config(out, frames_folder, iterations, **options):
     return TrainingConfig(
         out=out,
         iterations=iterations,
@@ -65,6 +73,7 @@ def config(out, frames_folder, iterations):
         average=0.5,
         learning_rate=1e-2,
         augmentation=Augmentation(shift=1.0),
+        **options,
     )
 
 
@@ -113,6 +122,93 @@ def test_a_seed_repeats_and_a_checkpoint_resumes(tmp_path, frames_folder, caplog
         resumed = train(config(tmp_path / "a", frames_folder, 5))
     assert resumed.iterations == 5
     assert "resuming from iteration 3" in caplog.text
+
+
+def test_fewer_channels_and_a_further_branch_learn_too(tmp_path, frames_folder):
+    settings = config(tmp_path, frames_folder, 60, channels=LEAN_CHANNELS, extras=EXTRAS)
+    assert len(LEAN_CHANNELS) == 16
+    result = train(settings)
+    assert result.losses["heat"] < 8.0
+    assert 0.0 < result.losses["iou"] < 1.0
+    recipe = described(settings, result)["recipe"]
+    assert recipe["extras"] == list(EXTRAS)
+    assert len(recipe["channels"]) == 16
+    # What is exported takes and gives what every head does.
+    path = export_head(result.network, tmp_path / "head", point_range=(-8, -8, -2, 8, 8, 6), training={})
+    card, _ = load_card(path)
+    assert card.input.shape == (1, 20, 64, 64)
+    frame = scene(3, reach=6.0)
+    DetectionHead(path, threads=1).detect_points(frame.xyz, frame.sensor_height)
+
+
+def test_the_channels_left_out_make_no_difference():
+    torch.manual_seed(0)
+    network = PillarCenterNet((8, 8, 8), channels=LEAN_CHANNELS, extras=("vx",)).eval()
+    pillars = torch.rand(1, 20, 32, 32)
+    other = pillars.clone()
+    other[:, 11:15] = torch.rand(1, 4, 32, 32)
+    maps, said = network.forward_all(pillars)
+    assert torch.equal(maps, network(other))
+    assert said.shape == (1, 1, 16, 16)
+    for options, message in (
+        ({"channels": ("z9",)}, "channels must be of"),
+        ({"extras": ("mass",)}, "extras must be of"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            PillarCenterNet((8, 8, 8), **options)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_overlap_is_that_of_the_solids_where_headings_agree(seed):
+    """Against the polygons' of `models.geometry`, within 1e-4: float32 logarithms and angles."""
+    from warploom.models.geometry import box_overlap
+
+    rng = np.random.default_rng(seed)
+    yaw = rng.uniform(-3, 3)
+    true = np.array([[*rng.uniform(-0.4, 0.4, 2), 0.8, 4.2, 1.8, 1.5, yaw]])
+    said = true + np.array([[*rng.normal(0, 0.4, 2), 0.2, 0.5, -0.2, 0.1, 0.0]])
+
+    def maps(box):
+        x, y, z, length, width, height, angle = box[0]
+        turn = [np.cos(2 * angle), np.sin(2 * angle), np.cos(angle), np.sin(angle)]
+        row = [x / 0.5, y / 0.5, z, *np.log([length, width, height]), *turn]
+        return torch.tensor(row, dtype=torch.float32)[None, :, None, None]
+
+    _, solid, _ = box_overlap(true, said)
+    assert float(overlap(maps(said), maps(true))) == pytest.approx(float(solid[0]), abs=1e-4)
+    turned = said + np.array([[0, 0, 0, 0, 0, 0, 0.4]])
+    assert float(overlap(maps(turned), maps(true))) < float(overlap(maps(said), maps(true)))
+
+
+def test_velocities_turn_with_the_frame_and_reach_the_targets():
+    frame = scene(5)
+    options = Augmentation(thin_rings=0.0, thin_points=0.0, tilt=0.0, scale=0.0, shift=0.0)
+    varied = augment(frame, np.random.default_rng(8), options)
+    c, s = np.cos(varied.boxes[:, 6]), np.sin(varied.boxes[:, 6])
+    along = varied.velocities[:, 0] * c + varied.velocities[:, 1] * s
+    before = frame.velocities[:, 0] * np.cos(frame.boxes[:, 6]) + frame.velocities[:, 1] * np.sin(frame.boxes[:, 6])
+    np.testing.assert_allclose(along, before, atol=1e-4)
+    arguments = (np.array([[1.3, -0.6, -0.9, 4.2, 1.8, 1.5, 2.0]], np.float32), np.array([0]), np.array([50]))
+    known = draw_targets(*arguments, (-8.0, -8.0), 0.5, (32, 32), velocities=np.array([[5.0, -2.0]]))
+    np.testing.assert_allclose(known.velocity[:, 14, 18], [0.5, -0.2], atol=1e-6)
+    assert np.isnan(draw_targets(*arguments, (-8.0, -8.0), 0.5, (32, 32)).velocity).all()
+
+
+def test_views_are_scans_of_one_street_in_files_of_their_own(tmp_path):
+    settings = TrainingConfig(out=tmp_path, iterations=1, frames=3, views=2)
+    make_views(settings.folder, range(FIRST, FIRST + 1), 2)
+    paths = [settings.frame_path(number) for number in range(3)]
+    assert [path.exists() for path in paths] == [True, True, False]
+    assert len(set(paths)) == 3
+    one, other = (load_frame(path) for path in paths[:2])
+    assert one.xyz.tobytes() == load_frame(paths[0]).xyz.tobytes()
+    assert len(one.boxes) > 0
+    assert one.velocities.shape == (len(one.boxes), 2)
+    first = simulate_frame(FIRST)  # the first view is the scene of the seed
+    np.testing.assert_allclose(one.xyz, first.xyz, atol=1.1e-3)
+    assert one.xyz.shape != other.xyz.shape
+    with pytest.raises(ValueError, match="views"):
+        TrainingConfig(out=tmp_path, iterations=1, views=0)
 
 
 def test_no_frames_is_said(tmp_path):
