@@ -10,12 +10,13 @@ from __future__ import annotations
 import warp as wp
 
 from .box_extent import Extent, write_box
-from .device import resolve_device  # noqa: F401  (starts Warp)
+from .device import module_apart
 
 __all__ = ["RUN", "find_hulls", "find_hulls_in_parts", "fit_hulls", "fit_hulls_in_parts"]
 
 # Which of two like sides wins must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
+_APART = module_apart(__name__, fuse_fp=False)
 
 RUN = wp.constant(128)
 """Points of a run."""
@@ -210,7 +211,7 @@ def _find_hulls_of_run(
         first = last
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def find_hulls(
     # in
     point_in: wp.array(dtype=wp.vec3),
@@ -295,7 +296,7 @@ def _fit_hull(
     write_box(cluster, point[first], c, s, wp.atan2(s, c), extent, min_size, boxes)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def fit_hulls(
     # in
     point_in: wp.array(dtype=wp.vec3),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from .box_extent import Extent, extent_of, write_box
-from .device import resolve_device  # noqa: F401  (starts Warp)
+from .device import module_apart
 
 __all__ = [
     "DIRECTIONS",
@@ -26,6 +26,7 @@ __all__ = [
 
 # Which of two like angles wins must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
+_APART = module_apart(__name__, fuse_fp=False)
 
 SAMPLES = wp.constant(64)
 DIRECTIONS = 96
@@ -192,7 +193,7 @@ def fit_l_shapes_in_parts(
 # ---- the same, for many threads
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def sample_evenly(
     # in
     point_in: wp.array(dtype=wp.vec3),
@@ -205,7 +206,7 @@ def sample_evenly(
     _sample(point_in, start_in, cluster, slot, sample_out)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def score_widely(
     # in
     sample_in: wp.array2d(dtype=wp.vec2),
@@ -221,7 +222,7 @@ def score_widely(
         score_out[cluster, group] = _score(sample_in, cluster, size, direction_in, group * _LANES * _STRIDE, _STRIDE)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def choose_directions(
     # in
     sample_in: wp.array2d(dtype=wp.vec2),
@@ -250,7 +251,7 @@ def _widen(reach: wp.array2d(dtype=wp.float32), cluster: int, side: int, distanc
         wp.atomic_max(reach, cluster, side + 1, -distance)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def measure_reach(
     # in
     point_in: wp.array(dtype=wp.vec3),
@@ -274,7 +275,7 @@ def measure_reach(
     _widen(reach, cluster, 4, p[2])
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def write_boxes(
     # in
     point_in: wp.array(dtype=wp.vec3),

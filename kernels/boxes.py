@@ -25,7 +25,7 @@ from .box_l_shape import (
     score_widely,
     write_boxes,
 )
-from .device import DEFAULT_DEVICE, resolve_device
+from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .interop import borrow, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
 from .threads import launch_parts, thread_count
@@ -33,6 +33,7 @@ from .threads import launch_parts, thread_count
 __all__ = ["FitBoxes", "fit_boxes"]
 
 _METHODS = ("l_shape", "min_area")
+_APART = module_apart(__name__)
 _LEAST_OF_PART = 8192  # points for which a thread of their own is worth its while
 _NON_FINITE, _TOO_MANY = (wp.constant(i) for i in range(2))
 
@@ -137,7 +138,7 @@ def _place_in_parts(
                 place[part, label] = place[part, label] + 1
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _key_points(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
@@ -169,7 +170,7 @@ def _key_points(
         key_out[i] = label
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _find_starts(
     # in
     key_in: wp.array(dtype=wp.int32),
@@ -190,7 +191,7 @@ def _find_starts(
     start_out[cluster] = low
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _copy_in_order(
     # in
     xyz_in: wp.array(dtype=wp.vec3),

@@ -239,7 +239,8 @@ TOUCH = (
         }
         return false;
     };
-    const auto touch = [&](const int a_begin, const int a_end, const int b_begin, const int b_end) __attribute__((noinline)) {
+    const auto touch = [&](const int a_begin, const int a_end, const int b_begin,
+                           const int b_end) __attribute__((noinline)) {
         const vec3 *a = points.data + a_begin, *b = points.data + b_begin;
         const int a_size = a_end - a_begin, b_size = b_end - b_begin;
         float surely = radius.surely, surely_not = radius.surely_not;

@@ -14,7 +14,7 @@ import warp as wp
 
 from ..errors import DeviceError
 
-__all__ = ["DEFAULT_DEVICE", "device_names", "resolve_device"]
+__all__ = ["DEFAULT_DEVICE", "device_names", "module_apart", "resolve_device"]
 
 DEFAULT_DEVICE = "cpu"
 
@@ -59,6 +59,18 @@ def device_names() -> list[str]:
     """The names of all devices of this machine: `cpu`, then `cuda:0`, and so on."""
     _initialise()
     return [str(device) for device in wp.get_devices()]
+
+
+def module_apart(name: str, fuse_fp: bool = True) -> wp.Module:
+    """A Warp module beside that of a file, for kernels which a CPU as a rule does not launch, nor then compiles.
+
+    Args:
+        name: The file's `__name__`.
+        fuse_fp: Warp's option of this name, which a file's own module does not hand on.
+    """
+    module = wp.get_module(f"{name}.apart")
+    wp.set_module_options({"fuse_fp": fuse_fp}, module)
+    return module
 
 
 def resolve_device(name: str | None = None) -> str:

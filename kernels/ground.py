@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from .backend import uses_taichi
-from .device import DEFAULT_DEVICE, resolve_device
+from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .ground_parts import GroundLimits, judge_cells_part, judge_points_part
 from .ground_plane import GroundPlane, above, lowest_point
 from .interop import adopt, borrow_points, count_on, give
@@ -31,6 +31,7 @@ __all__ = ["Ground", "GroundSegment", "elevation_grid", "segment_ground"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
+_APART = module_apart(__name__, fuse_fp=False)
 
 # The sweep.
 _START = wp.constant(2.5)  # [m] from the sensor, where the plane itself is the last sample
@@ -104,7 +105,7 @@ def _sweep(
         rise_out[first + k] = last_rise + slope * wp.clamp(radius_in[k] - last_r, 0.0, _EXTEND)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _sweep_segments(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
@@ -164,7 +165,7 @@ def _reconciled(rise: wp.array(dtype=wp.float32), radius: wp.array(dtype=wp.floa
     )
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _judge_cells(
     # in
     cells_in: wp.array2d(dtype=wp.int64),
@@ -193,7 +194,7 @@ def _judge_cells(
     surface_out[cell] = wp.vec4(surface[0] - half * r, half / r, top, -_BOTTOM - _BOTTOM_PER_METRE * r)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _judge_points(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
@@ -222,7 +223,7 @@ def _judge_points(
     mask_out[i] = height < surface[2] and height > surface[3]
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _sample_elevation(
     # in
     rise_in: wp.array(dtype=wp.float32),

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from .device import DEFAULT_DEVICE, resolve_device
+from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .ground_parts import bin_part
 from .parts import part_start
 from .polar_grid import FIRST_RING, LOW_WORD, RING_BITS, RINGS, SEGMENTS, cell_of
@@ -25,6 +25,7 @@ __all__ = ["FIRST_RING", "RINGS", "RING_BITS", "SEGMENTS", "GroundPlane", "above
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
+_APART = module_apart(__name__, fuse_fp=False)
 
 # The patches whose lowest points the plane is fitted to: 32 sectors, 8 octaves of r² from 2 to 32 m.
 _SECTORS = wp.constant(32)
@@ -60,7 +61,7 @@ def _level_bit(z: float) -> wp.int64:
     return wp.int64(1) << wp.int64(int((1000.0 + z) * 4.0) & 63)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _bin_points(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
@@ -106,7 +107,7 @@ def _candidate_of(xyz: wp.array(dtype=wp.vec3), cells: wp.array2d(dtype=wp.int64
     return wp.vec4(p[0], p[1], p[2], 0.1 + 0.01 * wp.sqrt(p[0] * p[0] + p[1] * p[1]))
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _pick_candidates(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
@@ -201,7 +202,7 @@ def _vote(candidates: wp.array(dtype=wp.vec4), number: int, sensor_height: float
     return (wp.int64(score) << wp.int64(32)) | wp.int64(_HYPOTHESES - number)
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _vote_planes(
     # in
     candidate_in: wp.array(dtype=wp.vec4),
@@ -236,7 +237,7 @@ def _add_inlier(candidates: wp.array(dtype=wp.vec4), number: int, best: wp.int64
         wp.atomic_add(sums, 8, wp.int64(y * z * _FIX))
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _sum_inliers(
     # in
     candidate_in: wp.array(dtype=wp.vec4),
@@ -283,7 +284,7 @@ def _settle(plane: wp.vec3, plane_out: wp.array(dtype=wp.vec3), found_height_out
     found_height_out[0] = -plane[2] / wp.sqrt(1.0 + plane[0] * plane[0] + plane[1] * plane[1])
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _settle_plane(
     # in
     candidate_in: wp.array(dtype=wp.vec4),

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from .box_overlap import SHAPE_ROWS, common_area, find_near, shape_boxes
-from .device import DEFAULT_DEVICE, resolve_device
+from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .interop import borrow, count_on, family_of, give
 from .plan import capacity_for, plan_for
 from .threads import launch_parts, thread_count
@@ -21,6 +21,7 @@ __all__ = ["RotatedNms", "rotated_nms"]
 
 # What overlaps too much must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
+_APART = module_apart(__name__, fuse_fp=False)
 
 _LAST = wp.constant(3.0e38)
 _A, _B = (wp.constant(row) for row in (2, 3))
@@ -55,7 +56,7 @@ def _suppresses(shapes: wp.array2d(dtype=wp.float32), i: int, j: int, threshold:
     return area > threshold * union
 
 
-@wp.kernel
+@wp.kernel(module=_APART)
 def _overlap_bits(
     # in
     shapes_in: wp.array2d(dtype=wp.float32),
