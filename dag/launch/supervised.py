@@ -191,6 +191,7 @@ class SupervisedProcess:
 
     async def live(self) -> None:
         """Lives, until it was asked to stop, or ended in another way that is final."""
+        self._log.write(b"")  # opens it: what a supervisor holds does not depend on what its processes print
         try:
             while not self._asked_to_stop:
                 code = await self._one_life()
