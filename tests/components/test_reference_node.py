@@ -156,3 +156,10 @@ def test_the_perception_of_the_node_is_that_of_the_pipeline(modules):
                 spec.config.pop("ego_box", None)
             assert mine == other, name
         assert ours.outputs == theirs.outputs
+
+
+def test_the_docs_say_the_purpose_of_each_file(repository):
+    table = (repository / "docs" / "node.md").read_text()
+    for name in (*FILES, *BESIDE):
+        description = load_module(CONF / "modules" / name).content.description
+        assert f"| `{name}` | {description} |" in table
