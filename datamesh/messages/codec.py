@@ -340,9 +340,15 @@ class Decoder:
             result[key] = self.value(depth)
         return result
 
+    def _dtype(self, depth: int) -> np.dtype:
+        if self.data[self.position : self.position + 1] != b"s":
+            return _dtype_of(self.value(depth))
+        self.position += 1
+        return _dtype_named(self._text())
+
     def _form(self, depth: int) -> tuple[np.dtype, tuple[int, ...], int]:
         """Type, shape, and number of bytes of an array."""
-        dtype = _dtype_of(self.value(depth))
+        dtype = self._dtype(depth)
         dimensions = self._count()
         if dimensions > 32:
             raise ValueError(f"an array of {dimensions} dimensions")
@@ -364,7 +370,7 @@ class Decoder:
         memory = self._memories[number]
         if offset + size > len(memory):
             raise ValueError(f"an array at {offset} to {offset + size} of a memory of {len(memory)} bytes")
-        return memory[offset : offset + size].view(dtype).reshape(shape)
+        return np.ndarray(shape, dtype, memory, offset)
 
     def _scalar(self, depth: int) -> Any:
         dtype = _dtype_of(self.value(depth))

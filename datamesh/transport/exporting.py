@@ -162,7 +162,8 @@ class Exporter:
         """What was sent, copied and dropped so far, and how many read."""
         with self._lock:
             self._collect_all()
-            return {**self._counts, "readers": len(self._readers), "slabs": self._pool.used}
+            counts = {"commits": 0, "sent": 0, "copied": 0, **self._counts}
+            return {**counts, "readers": len(self._readers), "slabs": self._pool.used}
 
     def stop(self) -> None:
         """Ends the export. What readers hold stays theirs."""
@@ -205,7 +206,7 @@ class Exporter:
             epoch = self.order.epoch(entry.epoch, entry.version)
             self._counts["commits"] += 1
             if self._readers:
-                newest = self._window.snapshot(entry.epoch).versions[-1:] == (entry.version,)
+                newest = self._window.snapshot().versions[-1] == entry.version
                 self._tell(entry, epoch, newest, self._readers)
 
     def _on_settle(self, version: int, epoch: int) -> None:
@@ -240,7 +241,7 @@ class Exporter:
         self._counts[reason] += len(readers)
         self._window.losses.count(self._window.topic, f"link_{reason}", version, len(readers))
 
-    def _encode(self, entry: Entry, epoch: int, newest: bool) -> tuple[Event, list[Slab], list[Any]]:
+    def _encode(self, entry: Entry, epoch: int, newest: bool) -> tuple[Event, list[Slab], list[Lease]]:
         """A datum as an event, the slabs that it is in, and what holds those that were taken for it.
 
         Raises:
@@ -248,47 +249,46 @@ class Exporter:
             TypeError: It has no form as a message.
         """
         slabs: list[Slab] = []
-        numbers: dict[int, int] = {}
-        leases: list[Any] = []
+        leases: list[Lease] = []
+        copies: SlabArena | None = None
 
-        def lease(size: int) -> Lease:
+        def take(size: int) -> Lease:
             found = self._lease(size)
             if found is None:
                 raise _NoRoom
             leases.append(found)
             return found
 
-        def number_of(slab: Slab) -> int:
-            if slab.offset not in numbers:
-                numbers[slab.offset] = len(slabs)
-                slabs.append(slab)
-            return numbers[slab.offset]
-
-        arena = SlabArena(lease, self._copied.size, lambda: None)
-
         def place(array: np.ndarray) -> tuple[int, int] | None:
+            nonlocal copies
             found = self._pool.locate(array)
             if found is None:
                 if array.nbytes <= _SMALL:
                     return None
-                copy = arena.array(array.shape, array.dtype)
+                if copies is None:
+                    copies = SlabArena(take, self._copied.size, lambda: None)
+                copy = copies.array(array.shape, array.dtype)
                 np.copyto(copy, array)
                 self._counts["copied_bytes"] += array.nbytes
                 found = self._pool.locate(copy)
                 assert found is not None
-            return number_of(found[0]), found[1]
+            if found[0] not in slabs:
+                slabs.append(found[0])
+            return slabs.index(found[0]), found[1]
 
-        value = entry.read()  # on the host, so what a device still writes is waited for
-        body: bytes | memoryview = encode(value, place)
+        # On the host: what a device still writes is waited for.
+        value = entry.value if entry.completion is None else entry.read()
+        body = encode(value, place)
         size = 0
-        self._counts["copied"] += arena.used.size > 0
-        self._copied = arena.used
+        if copies is not None:
+            self._counts["copied"] += 1
+            self._copied = copies.used
         if len(body) > INLINE:
-            one = lease(len(body))
+            one = take(len(body))
             one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
             slabs.append(one.key)
             size, body = len(body), b""
-        parts = tuple((slab.offset, slab.size) for slab in slabs)
+        parts = tuple([(slab.offset, slab.size) for slab in slabs])
         stamps = entry.received_ns, entry.committed_ns
         event = Event(COMMIT, 0, epoch, entry.version, *stamps, entry.triggers, newest, parts, body, size)
         return event, slabs, leases
@@ -371,17 +371,16 @@ class Exporter:
                 self._window.losses.count(self._window.topic, "link_slow", event.version)
                 return False
             poll = select.poll()
-            poll.register(reader.socket, select.POLLIN | (0 if slabs and self._is_full(reader) else select.POLLOUT))
+            poll.register(
+                reader.socket, select.POLLIN | (0 if slabs and reader.held >= reader.most else select.POLLOUT)
+            )
             poll.poll(50)
         return True
 
-    def _is_full(self, reader: _Reader) -> bool:
-        return reader.held >= reader.most
-
     def _try_send(self, reader: _Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
-        if slabs and self._is_full(reader):
+        if slabs and reader.held >= reader.most:
             self._collect(reader)
-            if self._is_full(reader):
+            if reader.held >= reader.most:
                 return False
         try:
             reader.socket.send(data)

@@ -51,7 +51,7 @@ os.register_at_fork(after_in_child=_close_inherited)
 _ANSWER_S = 2.0
 """How long a process that listens may take to answer."""
 _CREDENTIALS = struct.Struct("3i")
-_ORDER = struct.Struct("<8sQQ")
+_ORDER = struct.Struct("<QQ")
 _MAGIC = b"warploom"
 
 
@@ -229,14 +229,15 @@ class OrderFile:
         path = _path(node, topic, "order")
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
-            if os.fstat(fd).st_size != _ORDER.size:
+            size = len(_MAGIC) + _ORDER.size
+            if os.fstat(fd).st_size != size:
                 os.ftruncate(fd, 0)
-                os.ftruncate(fd, _ORDER.size)
-            self._map = mmap.mmap(fd, _ORDER.size)
+                os.ftruncate(fd, size)
+            self._map = mmap.mmap(fd, size)
         finally:
             os.close(fd)
-        magic, epoch, version = _ORDER.unpack_from(self._map)
-        self._before: tuple[int, int] | None = (epoch, version) if magic == _MAGIC else None
+        known = self._map[: len(_MAGIC)] == _MAGIC
+        self._before: tuple[int, int] | None = _ORDER.unpack_from(self._map, len(_MAGIC)) if known else None
         self._offset: int | None = None
         self._reached = (-1, -1)
 
@@ -244,11 +245,13 @@ class OrderFile:
         """The epoch under which others see an epoch of this process's window, and notes the version there."""
         if self._offset is None:
             self._offset = self._decide(epoch, version)
-        order = (epoch + self._offset, version)
-        if order > self._reached:
-            self._reached = order
-            _ORDER.pack_into(self._map, 0, _MAGIC, *order)
-        return order[0]
+        epoch += self._offset
+        if (epoch, version) > self._reached:
+            if self._reached[0] < 0:
+                self._map[: len(_MAGIC)] = _MAGIC
+            self._reached = (epoch, version)
+            _ORDER.pack_into(self._map, len(_MAGIC), epoch, version)
+        return epoch
 
     def settled(self, epoch: int, version: int) -> int | None:
         """The same for a settled version; None where the life before had reached it, and it is no news."""

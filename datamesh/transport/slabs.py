@@ -207,9 +207,10 @@ class SlabPool:
 
     def locate(self, array: np.ndarray) -> tuple[Slab, int] | None:
         """The slab in which an array lies, one piece in C order, and where; None where it lies elsewhere."""
-        if not array.flags.c_contiguous:
+        interface = array.__array_interface__
+        if interface["strides"] is not None:
             return None
-        offset = array.__array_interface__["data"][0] - self.region.address
+        offset = interface["data"][0] - self.region.address
         if not 0 <= offset < self.region.size:
             return None
         index = bisect_right(self._used, offset) - 1

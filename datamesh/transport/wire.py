@@ -86,7 +86,7 @@ def read_event(data: bytes, memory: int) -> Event:
     end = _HEAD.size + count * _SLAB.size
     if len(data) < end:
         raise ValueError(f"truncated: {count} slabs expected in {len(data) - _HEAD.size} bytes")
-    slabs = tuple(_SLAB.iter_unpack(memoryview(data)[_HEAD.size : end]))
+    slabs = tuple([_SLAB.unpack_from(data, at) for at in range(_HEAD.size, end, _SLAB.size)])
     for offset, size in slabs:
         if size == 0 or offset + size > memory:
             raise ValueError(f"a slab at {offset} of {size} bytes in a memory of {memory}")
