@@ -106,15 +106,6 @@ class Backlog:
         self._frames -= not settled
         return dropped
 
-    def rouse(self) -> None:
-        """Wakes a thread that waits in `take`, ahead of a trigger: a wake takes longer than a commit."""
-        if self._sleepers:
-            with self._lock:
-                wakes = self._sleepers > 0
-                self._sleepers -= wakes
-            if wakes:
-                self._wakes.put(None)
-
     def take(self) -> Trigger | None:
         """The oldest trigger, waited for; None once the backlog is closed and empty."""
         while True:

@@ -186,7 +186,7 @@ class DataProcessComponent(Component):
         after = self._advance if self._runs_later else None
         self._windows = {name: one.window for name, one in inputs.items()}
         if config.any:
-            self._source = AnyTrigger(inputs, self._offer, after, None if self._inline else self._rouse)
+            self._source = AnyTrigger(inputs, self._offer, after)
         elif config.all:
             tolerance = round(config.tolerance_ms * 1e6)
             self._source = AllTrigger(
@@ -228,11 +228,6 @@ class DataProcessComponent(Component):
             self.settle(dropped.version, dropped.epoch)
         if not self._runs_later and dropped is not trigger:
             self._advance()
-
-    def _rouse(self) -> None:
-        """Wakes the thread that a trigger is about to need."""
-        assert self.backlog is not None
-        self.backlog.rouse()
 
     def _advance(self) -> None:
         """Goes on with what waits, in the calling thread, where that is how it runs."""
@@ -403,11 +398,6 @@ class DagComponent(DataProcessComponent):
 
     def _start_serving(self) -> None:
         """The workers do that."""
-
-    def _rouse(self) -> None:
-        assert self._engine is not None
-        if self._free > 0:
-            self._engine.rouse()
 
     def _finish(self) -> None:
         """Finishes the frames that wait or are in flight, and closes the processors."""

@@ -237,14 +237,6 @@ class GraphEngine:
         self._sleepers -= wakes
         return wakes
 
-    def rouse(self) -> None:
-        """Wakes a worker for a frame that is about to be submitted: to wake takes longer than a commit."""
-        if self._sleepers:
-            with self._lock:
-                wakes = self._claim(1)
-            if wakes:
-                self._wakes.put(None)
-
     def _work(self) -> None:
         while True:
             with self._lock:

@@ -62,20 +62,13 @@ class AnyTrigger(TriggerSource):
     A version is settled when every input has settled it, or has gone past it without having it.
     """
 
-    def __init__(
-        self,
-        inputs: Mapping[str, Input],
-        offer: Offer,
-        after: Callable[[], None] | None = None,
-        before: Callable[[], None] | None = None,
-    ) -> None:
+    def __init__(self, inputs: Mapping[str, Input], offer: Offer, after: Callable[[], None] | None = None) -> None:
         """Subscribes to the inputs, which must be bound.
 
         Args:
             inputs: Those that trigger, by name.
             offer: Takes the triggers, in the thread that commits or settles.
             after: Is called in that thread when the commit or settle is through.
-            before: Is called in that thread when a commit begins.
         """
         self._windows = {name: one.window for name, one in inputs.items()}
         super().__init__(offer)
@@ -83,7 +76,7 @@ class AnyTrigger(TriggerSource):
         self._seen = _Seen()
         self._empty: dict[_Order, set[str]] = {}
         for name, window in self._windows.items():
-            window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after, before)
+            window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after)
 
     def _on_commit(self, name: str, entry: Entry) -> None:
         version, epoch = entry.version, entry.epoch

@@ -86,7 +86,6 @@ class Window(Generic[T]):
         self._on_commit: tuple[OnCommit, ...] = ()
         self._on_settle: tuple[OnSettle, ...] = ()
         self._after: tuple[Callable[[], None], ...] = ()
-        self._before: tuple[Callable[[], None], ...] = ()
         self._waits: list[Waiting[T]] = []
         self._held: list[_Held] = []
         self._modified: set[tuple[int, int]] = set()
@@ -118,11 +117,7 @@ class Window(Generic[T]):
         return state.entries[index] if index < len(state.versions) and state.versions[index] == version else None
 
     def subscribe(
-        self,
-        on_commit: OnCommit,
-        on_settle: OnSettle,
-        after: Callable[[], None] | None = None,
-        before: Callable[[], None] | None = None,
+        self, on_commit: OnCommit, on_settle: OnSettle, after: Callable[[], None] | None = None
     ) -> Callable[[], None]:
         """Calls back after each commit that was kept, and after each settle, in the thread that made it.
 
@@ -131,7 +126,6 @@ class Window(Generic[T]):
                 of a commit before the next one to this window, so it must be short.
             on_settle: Takes the version and its epoch.
             after: Is called when that is through, and others can commit: it may take its time, which is the producer's.
-            before: Is called when a commit begins, whether or not it will be kept, by any thread.
 
         Returns:
             Ends the subscription.
@@ -141,15 +135,12 @@ class Window(Generic[T]):
             self._on_settle = (*self._on_settle, on_settle)
             if after is not None:
                 self._after = (*self._after, after)
-            if before is not None:
-                self._before = (*self._before, before)
 
         def unsubscribe() -> None:
             with self._lock:
                 self._on_commit = tuple(one for one in self._on_commit if one is not on_commit)
                 self._on_settle = tuple(one for one in self._on_settle if one is not on_settle)
                 self._after = tuple(one for one in self._after if one is not after)
-                self._before = tuple(one for one in self._before if one is not before)
 
         return unsubscribe
 
@@ -176,8 +167,6 @@ class Window(Generic[T]):
         Raises:
             ValueError: There is one of its version, and `equal` is ERROR.
         """
-        for before in self._before:
-            before()
         with self._commit_lock:
             if isinstance(policy, Reorder):
                 status = self._hold(policy, entry, equal, triggers)

@@ -184,21 +184,6 @@ def test_a_closed_backlog_gives_back_what_is_settled_and_counts_no_loss():
     assert losses.as_dict() == {}
 
 
-def test_a_thread_that_is_roused_for_nothing_sleeps_again_and_misses_nothing():
-    backlog, losses = make(policy="block", depth=4)
-    taken = []
-    consumer = threading.Thread(target=lambda: taken.extend(trigger.version for trigger in iter(backlog.take, None)))
-    consumer.start()
-    for version in range(200):
-        for _ in range(version % 4):
-            backlog.rouse()
-        backlog.offer(Trigger(version))
-    backlog.close()
-    consumer.join(10)
-    assert taken == list(range(200))
-    assert losses.as_dict() == {}
-
-
 def test_who_takes_a_frame_is_told_and_settled_versions_are_none():
     backlog, told = make(policy="fifo", depth=4)[0], []
     backlog.on_taken = lambda trigger: told.append(trigger.version)

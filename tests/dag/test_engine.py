@@ -433,19 +433,6 @@ def test_a_slow_vertex_makes_its_frames_wait_and_drops_none():
     assert waits == sorted(waits), "each waits for all before it"
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_a_worker_that_is_roused_for_nothing_sleeps_again_and_misses_nothing(workers):
-    with Frames([vertex("a", ones, "input"), vertex("b", ones, "a")], workers) as frames:
-        for version in range(200):
-            for _ in range(version % 4):
-                frames.engine.rouse()
-            frames.submit(version, input=version)
-            if version % 10 == 0:
-                frames.wait()
-        frames.wait()
-        assert sorted(frames.done) == list(range(200))
-
-
 def test_what_is_left_out_of_a_frame_is_cut_in_it_alone():
     timings = []
     left_out = vertex("left_out", ones, "input")
