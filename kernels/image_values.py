@@ -16,40 +16,75 @@ wp.set_module_options({"fuse_fp": False})
 _RUN = wp.constant(1024)  # points that one part paints before it leaves as many to others
 
 
-@wp.func
-def _paint_point(
-    i: int,
-    pixel: wp.vec2,
-    visible: bool,
-    image: wp.array3d(dtype=Any),
-    bilinear: int,
-    values: wp.array2d(dtype=wp.float32),
-):
-    """What the image says at a point's pixel; beyond the outermost centres, what it says there."""
-    if not visible:
-        for channel in range(values.shape[1]):
-            values[i, channel] = 0.0
-        return
-    height = image.shape[0]
-    width = image.shape[1]
-    if bilinear == 0:
-        row = wp.min(int(pixel[1] + 0.5), height - 1)
-        column = wp.min(int(pixel[0] + 0.5), width - 1)
-        for channel in range(values.shape[1]):
-            values[i, channel] = float(image[row, column, channel])
-        return
-    u = wp.clamp(pixel[0], 0.0, float(width - 1))
-    v = wp.clamp(pixel[1], 0.0, float(height - 1))
-    left = int(u)
-    top = int(v)
-    right = wp.min(left + 1, width - 1)
-    bottom = wp.min(top + 1, height - 1)
-    a = u - float(left)
-    b = v - float(top)
-    for channel in range(values.shape[1]):
-        above = float(image[top, left, channel]) * (1.0 - a) + float(image[top, right, channel]) * a
-        below = float(image[bottom, left, channel]) * (1.0 - a) + float(image[bottom, right, channel]) * a
-        values[i, channel] = above * (1.0 - b) + below * b
+# In C++, as Warp's own indices are checked and strided anew for every channel of four pixels.
+_PAINT = """
+    const int height = image.shape[0], width = image.shape[1], channels = values.shape[1];
+    const long long down = image.strides[0] / sizeof(*image.data), across = image.strides[1] / sizeof(*image.data);
+    const long long deep = image.strides[2] / sizeof(*image.data);
+    const auto limited = [](const float along, const float most) { return along < 0.0f ? 0.0f : wp::min(along, most); };
+    // Beyond the outermost centres, what the image says there.
+    const auto paint_point = [&](const wp::vec2& pixel, float* value) {
+        if (!bilinear) {
+            const int row = wp::min((int)(pixel[1] + 0.5f), height - 1);
+            const int column = wp::min((int)(pixel[0] + 0.5f), width - 1);
+            const auto* from = image.data + row * down + column * across;
+            for (int channel = 0; channel < channels; ++channel) value[channel] = (float)from[channel * deep];
+            return;
+        }
+        const float u = limited(pixel[0], (float)(width - 1)), v = limited(pixel[1], (float)(height - 1));
+        const int left = (int)u, top = (int)v;
+        const long long right = left + 1 < width ? across : 0, bottom = top + 1 < height ? down : 0;
+        const float a = u - (float)left, b = v - (float)top;
+        const auto* from = image.data + top * down + left * across;
+        for (int channel = 0; channel < channels; ++channel, from += deep) {
+            const float above = (float)from[0] * (1.0f - a) + (float)from[right] * a;
+            const float below = (float)from[bottom] * (1.0f - a) + (float)from[bottom + right] * a;
+            value[channel] = above * (1.0f - b) + below * b;
+        }
+    };
+"""
+
+# Each turn adds an overload.
+for _dtype in (wp.uint8, wp.float32):
+
+    @wp.func_native(
+        _PAINT
+        + """
+        float* value = (float*)((char*)values.data + i * (long long)values.strides[0]);
+        if (visible) paint_point(pixel, value);
+        else
+            for (int channel = 0; channel < channels; ++channel) value[channel] = 0.0f;
+        """
+    )
+    def _paint_point(
+        i: int,
+        pixel: wp.vec2,
+        visible: bool,
+        image: wp.array3d(dtype=_dtype),
+        bilinear: int,
+        values: wp.array2d(dtype=wp.float32),
+    ):
+        """What the image says at a point's pixel."""
+
+    @wp.func_native(
+        _PAINT
+        + """
+        float* value = values.data + (long long)first * channels;
+        memset(value, 0, (long long)(last - first) * channels * 4);
+        for (int i = first; i < last; ++i, value += channels)
+            if (visible.data[i]) paint_point(pixels.data[i], value);
+        """
+    )
+    def _paint_run(
+        first: int,
+        last: int,
+        pixels: wp.array(dtype=wp.vec2),
+        visible: wp.array(dtype=wp.bool),
+        image: wp.array3d(dtype=_dtype),
+        bilinear: int,
+        values: wp.array2d(dtype=wp.float32),
+    ):
+        """The same for the points first … last − 1 of contiguous arrays."""
 
 
 @wp.kernel
@@ -86,8 +121,7 @@ def paint_in_parts(
     """Every so many runs of points, so that those in the image are shared out."""
     n = wp.min(count_in[0], points)
     for run in range(part, (n + _RUN - 1) / _RUN, parts):
-        for i in range(run * _RUN, wp.min((run + 1) * _RUN, n)):
-            _paint_point(i, pixels_in[i], visible_in[i], image_in, bilinear, values_out)
+        _paint_run(run * _RUN, wp.min((run + 1) * _RUN, n), pixels_in, visible_in, image_in, bilinear, values_out)
 
 
 for _dtype in (wp.uint8, wp.float32):

@@ -391,9 +391,6 @@ def inverse_perspective(
     family = family_of(image, "image")
     picture, owner = borrow_image(image)
     pose = np.asarray(vehicle_from_camera, np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9:
-        raise ValueError(f"vehicle_from_camera must be a finite rigid transform of shape (4, 4), not {pose}")
-    camera = camera_model(np.linalg.inv(pose), intrinsics, distortion)
     plan = plan_for(
         InversePerspective,
         image_size=(picture.shape[1], picture.shape[0]),
@@ -407,7 +404,9 @@ def inverse_perspective(
     # Cameras and planes seldom move: the pixels found last time mostly do.
     drawn_for = repr((pose.tolist(), np.asarray(intrinsics).tolist(), None if distortion is None else [*distortion]))
     if drawn_for != plan._drawn_for:
-        plan.set_camera(camera)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9:
+            raise ValueError(f"vehicle_from_camera must be a finite rigid transform of shape (4, 4), not {pose}")
+        plan.set_camera(camera_model(np.linalg.inv(pose), intrinsics, distortion))
         object.__setattr__(plan, "_drawn_for", drawn_for)
     flat = len(image.shape) == 2
     if family.device != DEFAULT_DEVICE:
