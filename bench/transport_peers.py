@@ -321,7 +321,7 @@ class Posix(Way):
     def receive(cls, name: str, size: int, count: int, queue: Any, ready: Any) -> Times:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as one:
             one.bind(_address(name))
-            memory = shared_memory.SharedMemory(name, track=False) if sys.version_info >= (3, 13) else _attached(name)
+            memory = shared_memory.SharedMemory(name)  # a child has its maker's tracker, which removes it once
             blocks = np.frombuffer(memory.buf, np.int64).reshape(cls.BLOCKS, -1)
             ready.set()
             times = [taken(blocks[one.recv(1)[0]]) for _ in range(count)]
@@ -329,15 +329,6 @@ class Posix(Way):
             del blocks
             memory.close()
         return times
-
-
-def _attached(name: str) -> shared_memory.SharedMemory:
-    """An existing memory, which its maker removes."""
-    from multiprocessing import resource_tracker
-
-    memory = shared_memory.SharedMemory(name)
-    resource_tracker.unregister(f"/{name}", "shared_memory")
-    return memory
 
 
 def _address(name: str) -> str:
@@ -375,6 +366,7 @@ def _child(way: str, name: str, size: int, count: int, queue: Any) -> Iterator[t
     there.close()
     try:
         yield ready, here
+        child.join(5.0)  # who is killed leaves its memory behind, with some of the peers
     finally:
         child.kill()
         child.join()
@@ -414,6 +406,7 @@ def send_all(way: str, size: int, count: int, every_s: float) -> np.ndarray:
             return np.array(result.recv(), np.int64).reshape(-1, 2)
     finally:
         sender.close()
+        queue.cancel_join_thread()  # what nobody has read is not waited for
         queue.close()
         with suppress(FileNotFoundError):
             os.unlink(_address(name))

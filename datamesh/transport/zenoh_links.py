@@ -59,6 +59,8 @@ class ZenohSession:
             settings.insert_json5("connect/endpoints", json.dumps(config.connect))
             settings.insert_json5("listen/endpoints", json.dumps(config.listen))
             settings.insert_json5("scouting/multicast/enabled", json.dumps(config.scouting))
+            # On one host topics go by slabs, and its segments outlive a process that is killed.
+            settings.insert_json5("transport/shared_memory/enabled", "false")
             self.session = zenoh.open(settings)
         except zenoh.ZError as error:
             raise ConfigError(

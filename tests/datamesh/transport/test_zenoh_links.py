@@ -1,5 +1,6 @@
 """Topics between hosts: two meshes that only know each other by zenoh, over the loopback of this machine."""
 
+import os
 import socket
 import threading
 import time
@@ -196,6 +197,8 @@ def test_an_endpoint_that_cannot_be_used_says_so(endpoint):
 
 
 def test_two_processes_meet_over_zenoh(peer, endpoint):
+    """One is killed, and comes back with lower versions; no segment of shared memory is left of it."""
+    before = set(os.listdir("/dev/shm"))
     reader = peer("read", "reader", "cloud", of="there", zenoh=config(connect=(endpoint,), domain="car"))
     reader.wait_for("ready")
     writer = peer("write", "writer", "cloud", 1, 200_000, 20, 200, zenoh=config(listen=(endpoint,), domain="car"))
@@ -208,3 +211,6 @@ def test_two_processes_meet_over_zenoh(peer, endpoint):
     while (one := reader.wait_for("read"))["epoch"] == 0:
         assert one["whole"]
     assert one["epoch"] == 1
+    again.kill()
+    reader.kill()
+    assert {name for name in set(os.listdir("/dev/shm")) - before if name.endswith(".zenoh")} == set()
