@@ -12,7 +12,7 @@ from ...kernels.device import resolve_device
 from ...kernels.raycast import LidarCast
 from .ego import mounting
 from .frame import SimulatedFrame
-from .furnishing import furnish, populate
+from .furnishing import furnish, grow, populate
 from .library import Library
 from .sensors import LIDARS, Lidar, lidar_model
 from .street import STYLES, Street, random_street
@@ -63,6 +63,8 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
     height = random.uniform(1.6, 2.1) if random.random() < 0.8 else random.uniform(1.2, 2.6)
     mount = mounting(mounting_height or height, random.normal(0, 0.012), random.normal(0, 0.01))
     speed = random.uniform(0.0, 14.0) if turning and random.random() < 0.8 else 0.0
+    # Last, so that it changes nothing else of the scenes.
+    grow(street, plan, random.uniform(0.0, 1.0 if style != "urban" else 0.5))
 
     def pose_at(t: float) -> np.ndarray:
         one = np.ones(1)
