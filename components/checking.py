@@ -18,7 +18,7 @@ from ..dag import (
     parse_overrides,
 )
 from ..dag.graph import declare_vertices
-from ..dag.launch.lookup import config_folders
+from ..dag.launch.lookup import config_folders, find_launch_file
 from ..errors import ConfigError
 from .execution import ExecutionContext
 from .messages import SensorFrame
@@ -32,10 +32,10 @@ FORMATS = {"text": draw_text, "mermaid": draw_mermaid, "svg": draw_svg}
 
 
 def check_file(name: str, settings: Iterable[str] = ()) -> list[str]:
-    """Validates a profile or a module file, with all the classes, models and settings it names.
+    """Validates a profile, a module or a launch file, with all the classes, models and settings it names.
 
     Args:
-        name: The path of a YAML file, or the name of a profile or a module.
+        name: The path of a file, or the name of a profile, a module or a launch file.
         settings: Changes by dotted key, as texts `key=value`.
 
     Returns:
@@ -47,6 +47,8 @@ def check_file(name: str, settings: Iterable[str] = ()) -> list[str]:
         DeviceError: There is no such device.
     """
     path, kind = _find(name)
+    if kind == "launch":
+        return _check_launch(path, settings)
     changes = {tuple(key.split(".")): value for key, value in parse_overrides(settings).items()}
     if kind == "profiles":
         return _check_profile(path, changes)
@@ -77,6 +79,23 @@ def _check_profile(path: Path, changes: Mapping[tuple[str, ...], Any]) -> list[s
     return [f"{path}: profile {profile.profile!r} is good", f"  device {device}, modules {profile.modules}"]
 
 
+def _check_launch(path: Path, settings: Iterable[str]) -> list[str]:
+    from .launching import plan_launch  # which is for Linux alone
+
+    launch = plan_launch(str(path), settings=settings)
+    plan = launch.plan
+    lines = [f"{path}: node {plan.node!r} is good"]
+    profile = plan.profile
+    assert profile is not None  # there is always one
+    context = execution_context(profile, profile_device(profile.content))
+    for process, files in plan.modules.items():
+        links = launch.links[process]
+        Process(files, context=context, external=dict.fromkeys(links.imports, object), prepare=False)
+        lines.append(f"  {process}: {len(files)} modules")
+        lines += [f"    reads {topic} of another process" for topic in links.imports]
+    return lines
+
+
 def _topics_elsewhere(file: ConfigFile[ModuleSpec]) -> dict[str, str]:
     """Topics that a module reads and does not give, but another module file gives, and the name of that module."""
     components = file.content.components
@@ -101,7 +120,7 @@ def draw_file(name: str, form: str = "text", settings: Iterable[str] = ()) -> st
     """Draws a module file, or all the modules of a profile.
 
     Args:
-        name: The path of a YAML file, or the name of a module or a profile.
+        name: The path of a file, or the name of a module, a profile or a launch file; of a launch file its graphs.
         form: One of `FORMATS`.
         settings: Changes by dotted key, as texts `key=value`.
 
@@ -110,7 +129,12 @@ def draw_file(name: str, form: str = "text", settings: Iterable[str] = ()) -> st
     """
     path, kind = _find(name, first="modules")
     changes = {tuple(key.split(".")): value for key, value in parse_overrides(settings).items()}
-    if kind == "profiles":
+    if kind == "launch":
+        from .launching import plan_launch
+
+        modules = plan_launch(str(path), settings=settings).plan.modules
+        files = [file for group in modules.values() for file in group if _has_graph(file)]
+    elif kind == "profiles":
         files = profile_modules(load_profile(str(path)), changes)
     else:
         files = [load_module(path, changes)]
@@ -121,24 +145,40 @@ def draw_file(name: str, form: str = "text", settings: Iterable[str] = ()) -> st
     return FORMATS[form](*(file.content for file in files))
 
 
+def _has_graph(file: ConfigFile[ModuleSpec]) -> bool:
+    return any(component.graph for component in file.content.components)
+
+
 def _find(name: str, first: str = "profiles") -> tuple[Path, str]:
-    """The file, and whether it belongs to the profiles or the modules; a name is looked for in `first` first."""
+    """The file, and whether it belongs to the profiles, the modules or the launch files; `first` is searched first."""
     direct = Path(name)
-    if direct.suffix in (".yaml", ".yml"):
-        if not direct.is_file():
+    if direct.suffix in (".yaml", ".yml", ".xml"):
+        if direct.is_file():
+            return direct, _kind(direct)
+        if direct.name != name or direct.suffix != ".xml":
             raise ConfigError(f"{direct}: there is no such file")
-        text = direct.read_text(encoding="utf-8", errors="replace")
-        top = {line.partition(":")[0] for line in text.splitlines() if line[:1].isalpha()}
-        if "profile" in top:
-            return direct, "profiles"
-        if "module" in top:
-            return direct, "modules"
-        raise ConfigError(f"{direct}:1: has neither a key 'profile' nor a key 'module', so it is not of a known kind")
     second = "modules" if first == "profiles" else "profiles"
-    try:
-        return find_config(name, first, CONF), first
-    except ConfigError as error:
+    told = []
+    for kind in (first, second):
         try:
-            return find_config(name, second, CONF), second
-        except ConfigError as other:
-            raise ConfigError(f"{error}; {other}") from None
+            return find_config(name, kind, CONF), kind
+        except ConfigError as error:
+            told.append(str(error))
+    try:
+        return find_launch_file(name, CONF), "launch"
+    except ConfigError as error:
+        raise ConfigError("; ".join([*told, str(error)])) from None
+
+
+def _kind(path: Path) -> str:
+    """What a file is, by its first keys."""
+    if path.suffix == ".xml":
+        return "launch"
+    text = path.read_text(encoding="utf-8", errors="replace")
+    top = {line.partition(":")[0] for line in text.splitlines() if line[:1].isalpha()}
+    for key, kind in (("processes", "launch"), ("profile", "profiles"), ("module", "modules")):
+        if key in top:
+            return kind
+    raise ConfigError(
+        f"{path}:1: has neither a key 'profile' nor a key 'module' nor a key 'processes', so it is not of a known kind"
+    )

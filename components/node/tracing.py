@@ -25,11 +25,19 @@ __all__ = ["TraceWriter", "TraceWriterConfig"]
 _log = logging.getLogger(__name__)
 
 
+def _run_base() -> Path:
+    try:
+        from ...dag.launch.run_folder import run_base
+    except ImportError:  # it is for Linux alone
+        return Path(tempfile.gettempdir())
+    return run_base()
+
+
 class TraceWriterConfig(ProcessorConfig):
     """Where to, and how much."""
 
     file: str = "trace-{name}-{pid}.json"
-    """The file; one without a folder lies in $WARPLOOM_RUN, or else in the folder for temporary files."""
+    """The file; one without a folder lies beside the folders of nodes, such as in $WARPLOOM_RUN."""
     seconds: float = Field(30.0, ge=0.0)
     """How long is traced from the start [s]; 0: nothing. A second of perception is some 100 kB."""
     results: tuple[str, ...] = (OBSTACLES_TOPIC,)
@@ -75,7 +83,7 @@ class TraceWriter(Component):
         except (KeyError, IndexError, ValueError) as error:
             raise ValueError(f"file: {{name}} and {{pid}} are the placeholders, not {error}") from None
         if path.parent == Path():
-            path = Path(os.environ.get("WARPLOOM_RUN") or tempfile.gettempdir()) / path
+            path = _run_base() / path
         return path
 
     def start(self) -> None:

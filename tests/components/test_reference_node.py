@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from warploom.components.checking import check_file
+from warploom.components.checking import check_file, draw_file
 from warploom.components.profile import CONF, execution_context, load_profile
 from warploom.dag import Process, find_config, load_module
 from warploom.dag.launch.linking import plan_links
@@ -163,3 +163,28 @@ def test_the_docs_say_the_purpose_of_each_file(repository):
     for name in (*FILES, *BESIDE):
         description = load_module(CONF / "modules" / name).content.description
         assert f"| `{name}` | {description} |" in table
+
+
+@pytest.mark.parametrize("form", ["yaml", "xml"])
+def test_the_launch_file_is_checked_as_any_other_file(form):
+    path = CONF / "launch" / f"{NODE}.launch.{form}"
+    lines = check_file(str(path))
+    assert lines[0] == f"{path}: node {NODE!r} is good"
+    assert lines[1:] == ["  compute3d_sched: 32 modules", "  planning_sched: 1 modules",
+                         "    reads perception/obstacles of another process"]  # fmt: skip
+
+
+def test_it_goes_by_its_name_too_and_a_mistake_in_it_is_told(tmp_path):
+    assert NODE in check_file(NODE)[0]
+    path = tmp_path / "mine.launch.yaml"
+    text = (CONF / "launch" / f"{NODE}.launch.yaml").read_text()
+    path.write_text(text.replace("statistics.yaml", "statistiks.yaml"))
+    with pytest.raises(ConfigError, match=r"mine\.launch\.yaml:\d+: .*did you mean 'statistics.yaml'"):
+        check_file(str(path))
+    path.write_text("hello: 1\n")
+    with pytest.raises(ConfigError, match="neither a key 'profile' nor a key 'module' nor a key 'processes'"):
+        check_file(str(path))
+
+
+def test_its_graphs_are_drawn():
+    assert "cluster" in draw_file(NODE)
