@@ -128,6 +128,8 @@ class DataProcessComponent(Component):
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
         self.trigger_inputs: tuple[str, ...] = ()
+        self.has_run = False
+        """Whether it is through with a frame: the first may take long, as kernels are compiled for it."""
         self.backlog: Backlog | None = None
         """The triggers that wait; None before `set_trigger`."""
         self._source = TriggerSource(self._offer)
@@ -332,6 +334,7 @@ class DataProcessComponent(Component):
             self.losses.count(self.name, "failed", trigger.version)
         self.settle(trigger.version, trigger.epoch)
         self._running = None
+        self.has_run = True
 
 
 class DagComponent(DataProcessComponent):
@@ -481,6 +484,7 @@ class DagComponent(DataProcessComponent):
 
     def _done(self, run: Run) -> None:
         trigger = run.trigger
+        self.has_run = True
         for name, version in trigger.inputs.items():
             if self._windows[name].check:
                 self._windows[name].verify_version(version, trigger.epoch)

@@ -26,7 +26,7 @@ from .schema import ProcessSpec
 if TYPE_CHECKING:
     from ..process import Process
 
-__all__ = ["CONFIGURATION", "Child", "ProcessLinks", "die_with", "fit_in", "show_name"]
+__all__ = ["CONFIGURATION", "Child", "ProcessLinks", "die_with", "show_name"]
 
 CONFIGURATION = 2
 """The exit code of a process whose configuration is bad: to start it again would not help."""
@@ -77,26 +77,6 @@ def show_name(name: str) -> None:
     """Sets the name that the system shows for this process: its first 15 bytes."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NAME, name.encode()[:15] + b"\0", 0, 0, 0)
-
-
-def fit_in(spec: ProcessSpec) -> list[str]:
-    """Takes the CPUs and the priority that the launch file says; gives what was not permitted, to be told."""
-    warnings = []
-    if spec.cpus:
-        try:
-            os.sched_setaffinity(0, spec.cpus)
-        except OSError as error:
-            there = sorted(os.sched_getaffinity(0))
-            warnings.append(f"cpus {spec.cpus}: {error.strerror}; it runs on {there}")
-    if spec.nice:
-        try:
-            os.setpriority(os.PRIO_PROCESS, 0, spec.nice)
-        except OSError as error:
-            warnings.append(
-                f"nice {spec.nice}: {error.strerror}; it stays at {os.getpriority(os.PRIO_PROCESS, 0)}. "
-                "A priority above the usual one needs CAP_SYS_NICE"
-            )
-    return warnings
 
 
 class Child:
@@ -153,8 +133,6 @@ class Child:
             The exit code: 0 after a stop, `CONFIGURATION` where what was to be built is wrong, 1 where it broke.
         """
         self._channel.send({"report": "building"})
-        for warning in fit_in(self._spec):
-            self._channel.send({"report": "warning", "message": warning})
         try:
             self._building = True
             process, links, exports = build()
@@ -170,7 +148,12 @@ class Child:
             return 1
         from .health import ProcessObserver, beat_period
 
-        observer = ProcessObserver(process, hang_s=self._spec.health_timeout_s, counters=links.counters)
+        observer = ProcessObserver(
+            process,
+            hang_s=self._spec.health_timeout_s,
+            first_s=self._spec.start_timeout_s,
+            counters=links.counters,
+        )
         self._channel.send({"report": "ready", "components": observer.description()})
         if self._orders.get() != "start":
             return 0

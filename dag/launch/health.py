@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -26,6 +27,7 @@ class ProcessObserver:
         process: Process,
         *,
         hang_s: float | None,
+        first_s: float = 0.0,
         counters: Callable[[], Mapping[str, Mapping[str, int]]] = dict,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -34,11 +36,13 @@ class ProcessObserver:
         Args:
             process: Which one.
             hang_s: How long a component may be at one frame before it hangs [s]; None: for ever.
+            first_s: The same of its first frame, for which kernels may have to be compiled, if that is longer [s].
             counters: Of its links to other processes, by topic.
             clock: By which that is measured [s].
         """
         self._process = process
         self._hang_s = hang_s
+        self._first_s = first_s
         self._counters = counters
         self._clock = clock
         self._at_work: dict[tuple[str, str], tuple[int, float]] = {}
@@ -110,13 +114,17 @@ class ProcessObserver:
                     since = before[1] if before is not None and before[0] == version else now
                     at_work[name, part] = (version, since)
         self._at_work = at_work
-        if self._hang_s is None:
-            return []
         return [
             f"{name}.{part} at version {version} for {now - since:.1f} s"
             for (name, part), (version, since) in at_work.items()
-            if now - since >= self._hang_s
+            if now - since >= self._limit(self._process.components[name])
         ]
+
+    def _limit(self, component: Component) -> float:
+        if self._hang_s is None:
+            return math.inf
+        started = isinstance(component, DataProcessComponent) and component.has_run
+        return self._hang_s if started else max(self._hang_s, self._first_s)
 
 
 def _kind(component: Component) -> str:

@@ -27,6 +27,7 @@ from typing import Any
 from .cgroup import ControlGroups
 from .channel import LINE_BYTES, pack_line
 from .child import CONFIGURATION
+from .placement import place
 from .restarts import Restarts
 from .run_folder import RotatedLog
 from .schema import ProcessSpec
@@ -390,6 +391,8 @@ class SupervisedProcess:
             warning = self._groups.join(self.spec.cgroup, process.pid)
             if warning is not None:
                 self.warn(warning)
+        for warning in place(process.pid, self.spec):
+            self.warn(warning)
         mail: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
         pidfd = os.pidfd_open(process.pid)
         loop.add_reader(pidfd, self._ended, loop, pidfd, process, mail)

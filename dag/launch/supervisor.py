@@ -106,6 +106,8 @@ class Supervisor:
     async def _run(self) -> int:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_IGN:
+                continue  # as nohup has it, and a shell for what runs in the background
             loop.add_signal_handler(number, self._interrupted, number)
         self._control = ControlServer(self.folder.control, self._answers())
         await self._control.open()

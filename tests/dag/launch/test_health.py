@@ -76,6 +76,33 @@ def test_what_is_at_one_frame_for_too_long_hangs(process, monkeypatch):
     assert observer.beat()["hanging"] == []
 
 
+def test_the_first_frame_may_take_longer(process, monkeypatch):
+    """Kernels may have to be compiled for it."""
+    now = [0.0]
+    observer = ProcessObserver(process, hang_s=5.0, first_s=300.0, clock=lambda: now[0])
+    at_work = {"process": 7}
+    monkeypatch.setattr(process.components["doubler"], "at_work", lambda: dict(at_work))
+    observer.beat()
+    now[0] = 299.0
+    assert observer.beat()["hanging"] == []
+    now[0] = 300.0
+    assert observer.beat()["hanging"] == ["doubler.process at version 7 for 300.0 s"]
+    at_work["process"] = 8
+    process.components["doubler"].has_run = True
+    observer.beat()
+    now[0] = 305.0
+    assert observer.beat()["hanging"] == ["doubler.process at version 8 for 5.0 s"]
+
+
+def test_a_component_has_run_once_it_is_through_with_a_frame(process):
+    component = process.components["doubler"]
+    assert not component.has_run
+    process.start()
+    commit(process, 1)
+    process.stop()
+    assert component.has_run
+
+
 def test_without_a_limit_nothing_hangs(process, monkeypatch):
     now = [0.0]
     observer = ProcessObserver(process, hang_s=None, clock=lambda: now[0])
