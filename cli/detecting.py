@@ -1,4 +1,4 @@
-"""Commands about detection heads: how good one is."""
+"""Commands about detection heads: how good one is, and where heads come from."""
 
 from __future__ import annotations
 
@@ -54,14 +54,15 @@ def eval_detection(
     review = Review.read(reviewed) if reviewed is not None else None
     if detections is None:
         from ..components.profile import execution_context, load_profile
-        from ..models.head import DetectionHead
+        from ..models.heads import open_head
 
         file = load_profile(profile)
         context = execution_context(file, device or file.content.device)
-        judged = DetectionHead(
+        judged = open_head(
             head or context.detector,
             device=context.device,
             threads=context.inference_threads,
+            precision=context.precision,
             score_threshold=LEAST_SCORE,
             capacity=context.capacity,
         )
@@ -77,3 +78,78 @@ def eval_detection(
     for line in lines_of(result):
         typer.echo(line)
     typer.echo(f"{page}")
+
+
+heads = typer.Typer(help="Detection heads: import, look at, quantise.", no_args_is_help=True)
+commands.add_typer(heads, name="head")
+
+
+@heads.command("import")
+def import_head(
+    kind: Annotated[str, typer.Argument(help="pointpillars, fcn3d, yolox, fastestdet or twinlitenet.")],
+    checkpoint: Annotated[Path, typer.Argument(help="What was downloaded: .pth, .npz or .onnx.")],
+    out: Annotated[Path, typer.Option(help="Folder for the ONNX file and the card.")] = Path("heads"),
+    config: Annotated[
+        Path | None, typer.Option("--config", help="For pointpillars: what differs from KITTI's configuration, YAML.")
+    ] = None,
+) -> None:
+    """Make a head (ONNX file and card) of a well-known checkpoint.
+
+    Example: `warploom head import pointpillars pointpillar_7728.pth --out heads`, then `models: {detector: …}` in a
+    profile, or `warploom eval detection --head heads/pointpillars.yaml …`
+    """
+    from ..errors import ConfigError
+
+    if config is not None and kind != "pointpillars":
+        raise typer.BadParameter("only pointpillars takes a configuration", param_hint="--config")
+    if kind == "pointpillars":
+        from ..models.importers.pointpillars import PointPillarsSpec, import_pointpillars
+
+        spec = PointPillarsSpec.read_file(config) if config is not None else None
+        card = import_pointpillars(checkpoint, out, spec=spec)
+    elif kind == "fcn3d":
+        from ..models.importers.fcn3d import import_fcn3d
+
+        card = import_fcn3d(checkpoint, out)
+    elif kind == "twinlitenet":
+        from ..models.importers.twinlitenet import import_twinlitenet
+
+        card = import_twinlitenet(checkpoint, out)
+    elif kind in ("yolox", "fastestdet"):
+        from ..models.importers.image_detectors import import_fastestdet, import_yolox
+
+        card = (import_yolox if kind == "yolox" else import_fastestdet)(checkpoint, out)
+    else:
+        raise ConfigError(f"no importer {kind!r}; there are: pointpillars, fcn3d, yolox, fastestdet, twinlitenet")
+    typer.echo(f"{card}")
+
+
+@heads.command("show")
+def show_head(
+    card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
+) -> None:
+    """Check a card and its model, and tell what it says."""
+    import yaml
+
+    from ..models.card import DEFAULT_CARD
+    from ..models.heads import read_card
+
+    read, model = read_card(card or DEFAULT_CARD)
+    typer.echo(yaml.safe_dump(read.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100).rstrip())
+    typer.echo(f"# {model}: {model.stat().st_size / 1e6:.1f} MB, as the card says")
+
+
+@heads.command("quantize")
+def quantize(
+    card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the ONNX file and the card.")] = Path("heads"),
+    frames: Annotated[int, typer.Option(min=1, help="Simulated scenes to calibrate with.")] = 24,
+) -> None:
+    """Write a variant of a head in eight bits, calibrated on simulated scenes; measure it with `warploom eval`."""
+    from ..components.evaluation.detection_frames import evaluation_frames
+    from ..models.card import DEFAULT_CARD
+    from ..models.quantization import quantize_head
+
+    scenes = evaluation_frames(f"sim:scenes?seeds=600-{599 + frames}")
+    path = quantize_head(card or DEFAULT_CARD, out, ((scene.points, scene.sensor_height) for scene in scenes))
+    typer.echo(f"{path}")

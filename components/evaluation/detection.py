@@ -20,7 +20,7 @@ from ...errors import SourceError
 from ...models.classes import UNKNOWN
 from ...models.detections import Detections
 from ...models.geometry import points_in_boxes
-from ...models.head import DetectionHead
+from ...models.heads import LidarHead
 from .detection_figures import figures_of
 from .detection_frames import EvaluationFrame, evaluation_frames
 from .detection_outcomes import FrameOutcome, judge
@@ -99,7 +99,7 @@ def _read_detections(folder: pathlib.Path, frame: EvaluationFrame) -> Detections
 
 def evaluate_detection(
     data: Sequence[str],
-    head: DetectionHead | pathlib.Path,
+    head: LidarHead | pathlib.Path,
     *,
     score: float | None = None,
     also: Sequence[float] = (),
@@ -119,8 +119,8 @@ def evaluate_detection(
         SourceError: Data that are missing or damaged.
         ValueError: A folder of results without a score.
     """
-    if isinstance(head, DetectionHead):
-        score = head.card.decode.score_threshold if score is None else score
+    if not isinstance(head, pathlib.Path):
+        score = _score_of(head.card) if score is None else score
         said = {
             "name": head.card.name,
             "sha256": head.card.sha256,
@@ -136,7 +136,7 @@ def evaluate_detection(
     for uri in data:
         for frame in evaluation_frames(uri):
             began = time.perf_counter()
-            if isinstance(head, DetectionHead):
+            if not isinstance(head, pathlib.Path):
                 found = head.detect_points(frame.points, frame.sensor_height)
                 dropped += head.overflow
             else:
@@ -149,6 +149,14 @@ def evaluate_detection(
         for kind in dict.fromkeys(each.frame.kind for each in outcomes)
     }
     return DetectionEvaluation(head=said, outcomes=outcomes, score=score, dropped=dropped, sets=sets)
+
+
+def _score_of(card: Any) -> float:
+    """The score that a card of any kind recommends."""
+    for part in (getattr(card, "decode", None), getattr(card, "read", None), card):
+        if hasattr(part, "score_threshold"):
+            return part.score_threshold
+    raise ValueError(f"score must be given: the card of {card.name} recommends none")
 
 
 def write_summary(result: DetectionEvaluation, out: pathlib.Path) -> None:

@@ -119,6 +119,9 @@ def write_head(
 
     folder.mkdir(parents=True, exist_ok=True)
     model = folder / f"{fields['name']}.onnx"
+    # The exporter runs the network once; threads that spin for each other take long where the cores are busy.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # the TorchScript exporter folds batch norms into convolutions
         torch.onnx.export(
@@ -131,6 +134,7 @@ def write_head(
             dynamic_axes={name: dict(axes) for name, axes in (free or {}).items()},
             dynamo=False,
         )
+    torch.set_num_threads(threads)
     model.write_bytes(stamp(model.read_bytes(), classes=",".join(fields["classes"])))
     path = folder / f"{fields['name']}.yaml"
     written = card(**fields, file=model.name, sha256=file_sha256(model), opset=OPSET)

@@ -15,6 +15,15 @@ from warploom.models.importers.twinlitenet import TwinLiteNet, import_twinlitene
 cv2 = pytest.importorskip("cv2")
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Threads that spin for each other take a minute for this where the cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 class Authors:
     """model/TwinLite.py, with the state dict as it is."""
 
