@@ -7,13 +7,13 @@ import sys
 import typer
 
 from ..errors import ConfigError, DeviceError, ModelError, WarploomError
-from . import detecting, inspecting, measuring, node, profile, recording, running
+from . import configuring, detecting, inspecting, measuring, node, profile, recording, running
 from .application import app
 
 __all__ = ["app", "main"]
 
 # In the order in which the help lists them.
-for _part in (running, node, inspecting, recording, measuring, profile, detecting):
+for _part in (running, node, inspecting, configuring, recording, measuring, profile, detecting):
     app.add_typer(_part.commands)
 
 
