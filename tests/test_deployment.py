@@ -128,7 +128,6 @@ def unit() -> configparser.ConfigParser:
 def test_the_unit_runs_the_integrated_folder_and_stops_in_time(unit):
     service = unit["Service"]
     assert service["ExecStart"] == "/opt/warploom/bin/start_all %i"
-    assert service["ExecStartPre"].endswith("start-all %i --check")
     assert service["KillSignal"] == "SIGTERM"
     assert service["KillMode"] == "mixed", "the launcher stops its processes; the others are killed at the end"
     assert service["RestartPreventExitStatus"] == "2"
