@@ -4,9 +4,11 @@ import ast
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
@@ -30,8 +32,11 @@ def folder(tmp_path_factory) -> pathlib.Path:
 @pytest.fixture
 def environment(tmp_path):
     """Nothing of the environment of the tests but the kernels that are compiled already."""
+    # The path of a Unix socket must be short, and that of pytest's folders is not.
+    runs = pathlib.Path(tempfile.mkdtemp(prefix="wl-"))
     kept = {name: os.environ[name] for name in ("PATH", "WARP_CACHE_PATH") if name in os.environ}
-    return {**kept, "HOME": str(tmp_path), "WARPLOOM_RUN": str(tmp_path / "run"), "COLUMNS": "200"}
+    yield {**kept, "HOME": str(tmp_path), "WARPLOOM_RUN": str(runs), "COLUMNS": "200"}
+    shutil.rmtree(runs)
 
 
 def run(folder, script, *arguments, environment, cwd, timeout=300):
