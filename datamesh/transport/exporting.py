@@ -35,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 _SMALL = 1024
 """Arrays up to so many bytes go with the message, unless they are in a slab already."""
+_COUNTING_S = 0.1
 _NAMES = 256
 """Of how many readers it is known what they were sent, for when they come back."""
 
@@ -160,10 +161,14 @@ class Exporter:
 
     def counters(self) -> Mapping[str, int]:
         """What was sent, copied and dropped so far, and how many read."""
-        with self._lock:
-            self._collect_all()
-            counts = {"commits": 0, "sent": 0, "copied": 0, **self._counts}
-            return {**counts, "readers": len(self._readers), "slabs": self._pool.used}
+        if self._lock.acquire(timeout=_COUNTING_S):  # held for long where a commit waits for a reader that blocks
+            try:
+                self._collect_all()
+                self._pool.collect()
+            finally:
+                self._lock.release()
+        counts = {"commits": 0, "sent": 0, "copied": 0, **self._counts}
+        return {**counts, "readers": len(self._readers), "slabs": self._pool.used}
 
     def stop(self) -> None:
         """Ends the export. What readers hold stays theirs."""

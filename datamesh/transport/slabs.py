@@ -155,8 +155,7 @@ class SlabPool:
 
     @property
     def used(self) -> int:
-        """How many slabs somebody holds."""
-        self.collect()
+        """How many slabs somebody holds; `collect` first, for what was let go of just now."""
         return len(self._slabs)
 
     def take(self, size: int) -> Slab | None:

@@ -328,6 +328,7 @@ class TestReaders:
             thread.start()
             thread.join(0.3)
             assert thread.is_alive(), "it waits"
+            assert writer.counts("topic")["sent"] == 2, "and who asks how it goes is answered"
         thread.join(30)
         assert not thread.is_alive()
         assert writer.counts("topic")["readers"] == 0
