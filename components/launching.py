@@ -32,7 +32,14 @@ if TYPE_CHECKING:
     from ..dag.launch.run_folder import RunFolder
     from ..dag.launch.table import LiveTable
 
-__all__ = ["DEFAULT_PROFILE", "Launch", "check_launch", "monitor_processes", "plan_launch", "run_launch"]
+__all__ = [
+    "DEFAULT_PROFILE",
+    "Launch",
+    "check_launch",
+    "monitor_processes",
+    "plan_launch",
+    "run_launch",
+]
 
 DEFAULT_PROFILE = "cpu"
 """Of a launch that names none."""
@@ -125,7 +132,7 @@ def _profile(
 
 
 def check_launch(launch: Launch, *, build: bool = True) -> list[Finding]:
-    """What the preflight checks find; then, with `build`, makes every process as its child would, and lets it go again.
+    """What the preflight checks find; then, with `build`, validates every process with all its classes and settings.
 
     Raises:
         ConfigError: A process cannot be built.
@@ -138,7 +145,7 @@ def check_launch(launch: Launch, *, build: bool = True) -> list[Finding]:
     findings = run_checks(launch.plan)
     if build and all(finding.ok for finding in findings):
         for name, files in launch.plan.modules.items():
-            build_process(list(files), launch.plan.profile, launch.links[name].imports)
+            build_process(files, launch.plan.profile, launch.links[name].imports, prepare=False)
     return findings
 
 
@@ -157,9 +164,13 @@ def monitor_processes() -> list[ProcessSpec]:
 
 
 def build_process(
-    files: Sequence[ConfigFile[ModuleSpec]], profile: ConfigFile[Profile], imports: Iterable[str]
+    files: Sequence[ConfigFile[ModuleSpec]],
+    profile: ConfigFile[Profile],
+    imports: Iterable[str],
+    *,
+    prepare: bool = True,
 ) -> Process:
-    """Makes a process of a profile; nothing is started.
+    """Makes a process of a profile; nothing is started. Without `prepare` it is only to be looked at.
 
     Raises:
         ConfigError: A module does not fit.
@@ -175,6 +186,7 @@ def build_process(
         external=dict.fromkeys(imports, object),
         on_timing=context.timings,
         check=profile.content.check,
+        prepare=prepare,
     )
 
 
