@@ -1,6 +1,7 @@
-"""The simulator: sweeps in an instant and in a turn, with visibility; images; scenes alone and as views of one street."""
+"""The simulator: sweeps in an instant and in a turn, images, scenes alone and as views of one street."""
 
 import pytest
+
 from warploom.kernels.threads import set_thread_count, thread_count
 from warploom.models.simulator import Camera, Simulator, sample_scene, sample_views
 

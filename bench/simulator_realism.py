@@ -7,6 +7,7 @@ from the one has something to unlearn on the other: the table says where, and by
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -38,11 +39,11 @@ def scan_statistics(points: np.ndarray) -> dict[str, float]:
     """What can be said of one scan without labels; points [m], shape (n, 3)."""
     distance = np.linalg.norm(points, axis=1)
     said = {"points": float(len(points))}
-    for low, high in zip(_RANGES[:-1], _RANGES[1:], strict=True):
+    for low, high in itertools.pairwise(_RANGES):
         said[f"range {low:.0f} to {high:.0f} m"] = float(np.mean((distance >= low) & (distance < high)))
     near = np.hypot(points[:, 0], points[:, 1]) < _REACH
     height = points[near, 2] + _SENSOR_HEIGHT
-    for low, high in zip(_HEIGHTS[:-1], _HEIGHTS[1:], strict=True):
+    for low, high in itertools.pairwise(_HEIGHTS):
         said[f"height {low:.1f} to {high:.1f} m"] = float(np.mean((height >= low) & (height < high)))
     cells = np.floor(points[near, :2] / _CELL).astype(np.int64)
     _, pillar, size = np.unique(cells[:, 0] * 100_003 + cells[:, 1], return_inverse=True, return_counts=True)
@@ -90,11 +91,11 @@ def main(
     )
     real |= _mean(_real_classes(data))
     simulated |= _mean({n: float(np.isin(f.point_class, c).mean()) for n, c in _SIMULATED.items()} for f in frames)
-    print(f"{'':38s}{'real':>10s}{'simulated':>12s}{'real / sim':>12s}")
+    typer.echo(f"{'':38s}{'real':>10s}{'simulated':>12s}{'real / sim':>12s}")
     for name, value in real.items():
         other = simulated[name]
         shown = f"{value:10.0f}{other:12.0f}" if value > 50 else f"{value:10.3f}{other:12.3f}"
-        print(f"{name:38s}{shown}{value / max(other, 1e-9):12.2f}")
+        typer.echo(f"{name:38s}{shown}{value / max(other, 1e-9):12.2f}")
 
 
 if __name__ == "__main__":
