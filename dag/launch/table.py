@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from .supervisor import Supervisor
@@ -36,16 +37,20 @@ class JsonLines:
 
 
 class LiveTable:
-    """Shows the processes and the last events on a terminal, anew at each event and at most four times a second."""
+    """Shows the processes and the last events on a terminal, anew at each event and whenever it is refreshed."""
 
-    def __init__(self) -> None:
+    def __init__(self, console: Console | None = None) -> None:
+        """Prepares.
+
+        Args:
+            console: Where it is drawn; by default the terminal.
+        """
         from rich.console import Console
         from rich.live import Live
 
         self._supervisor: Supervisor | None = None
         self._events: list[Mapping[str, Any]] = []
-        self._console = Console()
-        self._live = Live(console=self._console, auto_refresh=False, transient=False)
+        self._live = Live(console=console or Console(), auto_refresh=False, transient=False)
 
     def show(self, supervisor: Supervisor) -> None:
         """Begins to show a supervisor."""

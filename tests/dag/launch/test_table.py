@@ -6,7 +6,15 @@ import json
 import pytest
 from rich.console import Console
 
-from warploom.dag.launch.table import JsonLines, component_table, duration_text, event_text, process_table, topic_table
+from warploom.dag.launch.table import (
+    JsonLines,
+    LiveTable,
+    component_table,
+    duration_text,
+    event_text,
+    process_table,
+    topic_table,
+)
 
 STATUS = {
     "node": "two",
@@ -87,6 +95,27 @@ def test_an_event_is_a_line_to_read_or_of_json():
     out = io.StringIO()
     JsonLines(out)(event)
     assert json.loads(out.getvalue()) == event
+
+
+def test_the_live_table_shows_processes_and_the_last_events(monkeypatch):
+    from warploom.dag.launch import status
+
+    monkeypatch.setattr(status, "node_status", lambda supervisor: STATUS)
+    out = io.StringIO()
+    table = LiveTable(Console(file=out, width=200, force_terminal=True))
+    table({"event": "launching", "time": 0})  # before there is anything to show
+    assert out.getvalue() == ""
+    table.show(object())
+    table({"event": "died", "process": "compute", "time": 0, "reason": "was ended by SIGKILL", "last_lines": ["oops"]})
+    for number in range(20):
+        table({"event": "warning", "process": "compute", "time": 0, "message": f"warning {number}"})
+    table.refresh()
+    table.close()
+    last = out.getvalue().rsplit("node two", 1)[1]
+    assert "compute" in last
+    assert "warning 19" in last
+    assert "warning 11" not in last
+    assert "| oops" in out.getvalue()
 
 
 def test_a_reader_that_is_gone_does_not_break_the_supervisor():

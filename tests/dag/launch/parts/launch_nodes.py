@@ -81,9 +81,20 @@ class Node:
         """Waits until a condition holds, which is looked at now and then."""
         until = time.monotonic() + seconds
         while not (found := condition()):
-            assert time.monotonic() < until, f"not in time; {self.events[-20:]}"
+            assert time.monotonic() < until, f"not in time; {self._told()}"
             time.sleep(0.05)
         return found
+
+    def _told(self):
+        """What can be known of a node that does not do what it should: its state, and the stacks of its processes."""
+        texts = [str(self.events[-8:])]
+        for process in self.ask("ps")["processes"]:
+            texts.append(f"{process['name']} {process['state']} {process['losses']} {process['links']}")
+            if process["state"] == "running":
+                os.kill(process["pid"], signal.SIGUSR1)
+        time.sleep(0.5)
+        texts += [path.read_text()[-4000:] for path in Path(self.environment["WARPLOOM_RUN"]).glob("*/log/*.log")]
+        return "\n".join(texts)
 
     def signal(self, number=signal.SIGTERM):
         self.supervisor.send_signal(number)
