@@ -42,11 +42,18 @@ def bench(
 
 @evaluation.command("tracking")
 def eval_tracking(
-    data: Annotated[Path, typer.Option("--data", help="KITTI's tracking set: label_02/, calib/, oxts/.")],
-    detections: Annotated[
-        Path,
-        typer.Option("--detections", help="Folder of SSSS.txt with the detections of a type, or its name in DATA."),
+    data: Annotated[
+        str,
+        typer.Option("--data", help="KITTI's tracking set: label_02/, calib/, oxts/; or a drive, such as sim:street."),
     ],
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            "--detections",
+            help="Folder of SSSS.txt with the detections of a type, or its name in DATA; "
+            "without it the profile's own head and clusters find the objects in the scans.",
+        ),
+    ] = None,
     sequences: Annotated[
         str, typer.Option("--sequences", help="Such as 0001,0012; by default all with labels and detections.")
     ] = "",
@@ -54,21 +61,42 @@ def eval_tracking(
         "warploom-eval"
     ),
     tracker: Annotated[
-        str, typer.Option("--tracker", help="The tracker's settings: a YAML file, or a name in conf/trackers.")
+        str,
+        typer.Option("--tracker", help="For detections: the tracker's settings, a file or a name in conf/trackers."),
     ] = "pointrcnn",
+    profile: Annotated[str, typer.Option("--profile", help="For scans: the profile whose pipeline runs.")] = "cpu",
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one by its dotted key, such as vehicle.coast=2.0."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change a setting of the tracker, or of the profile's modules."
+        ),
     ] = None,
 ) -> None:
-    """Track detections on KITTI's tracking set, and score the tracks: sAMOTA, MOTA and HOTA.
+    """Track objects and score the tracks: sAMOTA, MOTA, HOTA; on a drive of the simulator velocities and ids as well.
 
     Example: `warploom eval tracking --data kitti_tracking --detections pointrcnn_Car --out car`
+    Example: `warploom eval tracking --data kitti_tracking --sequences 0000`
+    Example: `warploom eval tracking --data "sim:occlusion?seed=3&duration=9"`
     """
-    from ..components.evaluation.tracking import evaluate_tracking, lines_of
+    from ..components.evaluation import tracking, tracking_objects
     from ..components.perception.tracker_settings import load_tracker
 
-    config = load_tracker(tracker, settings or ())
     names = [name for name in sequences.split(",") if name]
-    for line in lines_of(evaluate_tracking(data, detections, out, sequences=names, config=config)):
+    if ":" in data and not Path(data).exists():
+        lines = tracking_objects.lines_of_drive(
+            tracking_objects.evaluate_drive(data, profile=profile, settings=settings or ())
+        )
+    elif detections is None:
+        found = [
+            result
+            for name in names or ["0000"]
+            for result in tracking_objects.evaluate_scans(Path(data), name, profile=profile, settings=settings or ())
+        ]
+        lines = [line for result in found for line in tracking.lines_of(result)]
+    else:
+        config = load_tracker(tracker, settings or ())
+        lines = tracking.lines_of(
+            tracking.evaluate_tracking(Path(data), detections, out, sequences=names, config=config)
+        )
+    for line in lines:
         typer.echo(line)

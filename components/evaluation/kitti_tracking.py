@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import SourceError
 from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ...models.evaluation.tracking import TrackTable
-from ...models.geometry import KittiCalibration, box_corners, invert, kitti_poses
+from ...models.geometry import KittiCalibration, box_corners, invert, kitti_poses, transform_boxes
 
 __all__ = ["TYPES", "ObjectType", "TrackingSequence", "detection_format", "sequence_names", "write_results"]
 
@@ -108,10 +108,12 @@ class TrackingSequence:
     """By frame the areas of the image without labels: left, top, right, bottom [pixels], shape (k, 4)."""
     projection: np.ndarray
     """Pixels of the left colour camera from the rectified frame, shape (3, 4)."""
+    renamed_from_lidar: np.ndarray
+    """Shape (4, 4)."""
 
     @classmethod
     def read(
-        cls, data: pathlib.Path, detections: pathlib.Path, name: str, kind: ObjectType, *, logits: bool = False
+        cls, data: pathlib.Path, detections: pathlib.Path | None, name: str, kind: ObjectType, *, logits: bool = False
     ) -> TrackingSequence:
         """Reads a sequence.
 
@@ -120,7 +122,7 @@ class TrackingSequence:
 
         Args:
             data: Folder with `label_02/`, `calib/` and, for the ego poses, `oxts/`.
-            detections: Folder with `NAME.txt`: frame, type, image box (4), score, h w l x y z ry, alpha.
+            detections: Folder with `NAME.txt`: frame, type, image box (4), score, h w l x y z ry, alpha; None: without.
             name: Of the sequence, such as `0001`.
             kind: The type to read.
             logits: Whether scores are logits, as `detection_format` tells.
@@ -130,7 +132,8 @@ class TrackingSequence:
         """
         calibration = KittiCalibration.read(data / "calib" / f"{name}.txt")
         labels, dont_care = _read_labels(data / "label_02" / f"{name}.txt", kind)
-        found = _numbers(detections / f"{name}.txt", ",").reshape(-1, _DETECTION_COLUMNS)
+        rows = np.empty(0) if detections is None else _numbers(detections / f"{name}.txt", ",")
+        found = rows.reshape(-1, _DETECTION_COLUMNS)
         found = found[found[:, 1] == kind.number]
         oxts = data / "oxts" / f"{name}.txt"
         poses, first = None, 0
@@ -159,7 +162,20 @@ class TrackingSequence:
             poses=poses,
             dont_care=dont_care,
             projection=calibration.projection[_CAMERA],
+            renamed_from_lidar=_AXES @ calibration.rectified_from_lidar,
         )
+
+    def renamed(self, boxes: np.ndarray) -> np.ndarray:
+        """Boxes of the lidar's frame in the renamed one, shape (k, 7)."""
+        return transform_boxes(np.asarray(boxes, np.float64), self.renamed_from_lidar)
+
+    def in_view(self, boxes: np.ndarray) -> np.ndarray:
+        """Whether the centres of boxes are before the camera and in its image, shape (k,), bool."""
+        centre = np.asarray(boxes, np.float64)[:, :3] @ _AXES[:3, :3]
+        u, v, w = (np.c_[centre, np.ones(len(centre))] @ self.projection.T).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside = (u / w >= 0.0) & (u / w <= _IMAGE[0]) & (v / w >= 0.0) & (v / w <= _IMAGE[1])
+        return (w > 0.0) & inside
 
     def image_boxes(self, boxes: np.ndarray) -> np.ndarray:
         """Left, top, right, bottom of boxes in the image, cut at its edges [pixels], shape (k, 4)."""

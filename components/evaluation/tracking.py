@@ -18,7 +18,15 @@ from ...models.tracker import Tracker, TrackerConfig
 from .kitti_tracking import ObjectType, TrackingSequence, detection_format, sequence_names, write_results
 from .plots import draw_recall
 
-__all__ = ["OVERLAPS", "TrackingEvaluation", "evaluate_tracking", "lines_of", "track", "track_confidences"]
+__all__ = [
+    "OVERLAPS",
+    "TrackingEvaluation",
+    "evaluate_tracking",
+    "lines_of",
+    "score_tracks",
+    "track",
+    "track_confidences",
+]
 
 OVERLAPS = (0.25, 0.5, 0.7)
 """3D overlaps at which a track counts as right."""
@@ -41,7 +49,7 @@ class TrackingEvaluation:
     hota: Hota
     """Of the tracks from the score on that gives the highest MOTA at a 3D overlap of 0.5, as AB3DMOT chooses it."""
     frames_per_second: float
-    """Of the tracker alone, over all sequences."""
+    """Of the tracker alone, over all sequences; NaN where it was not measured."""
     dropped: dict[str, int]
     """Detections that the tracker left out, by reason."""
 
@@ -50,7 +58,7 @@ class TrackingEvaluation:
         return {
             "type": self.kind.name,
             "sequences": list(self.sequences),
-            "frames_per_second": self.frames_per_second,
+            "frames_per_second": self.frames_per_second if self.frames_per_second > 0.0 else None,
             "detections_dropped": self.dropped,
             "hota": {
                 "HOTA": 100 * self.hota.hota,
@@ -148,6 +156,28 @@ def _from_score(table: TrackTable, score: float) -> TrackTable:
     )
 
 
+def score_tracks(
+    kind: ObjectType,
+    names: Sequence[str],
+    truth: list[TrackTable],
+    tables: list[TrackTable],
+    *,
+    frames_per_second: float,
+    dropped: dict[str, int],
+) -> TrackingEvaluation:
+    """All figures of the tracks of some sequences."""
+    averages = {overlap: average_mot(truth, tables, threshold=overlap) for overlap in OVERLAPS}
+    best = _best_score(averages[_USUAL_OVERLAP])
+    return TrackingEvaluation(
+        kind=kind,
+        sequences=tuple(names),
+        averages=averages,
+        hota=hota(truth, [_from_score(table, best) for table in tables]),
+        frames_per_second=frames_per_second,
+        dropped=dropped,
+    )
+
+
 def evaluate_tracking(
     data: pathlib.Path,
     detections: pathlib.Path,
@@ -192,19 +222,16 @@ def evaluate_tracking(
         seconds += took
         for reason, count in tracker.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
+    speed = sum(len(sequence.frames) for sequence in read) / max(seconds, 1e-9)
     truth = [sequence.truth for sequence in read]
-    averages = {overlap: average_mot(truth, tables, threshold=overlap) for overlap in OVERLAPS}
-    result = TrackingEvaluation(
-        kind=kind,
-        sequences=tuple(names),
-        averages=averages,
-        hota=hota(truth, [_from_score(table, _best_score(averages[_USUAL_OVERLAP])) for table in tables]),
-        frames_per_second=sum(len(sequence.frames) for sequence in read) / max(seconds, 1e-9),
-        dropped=dropped,
-    )
+    result = score_tracks(kind, names, truth, tables, frames_per_second=speed, dropped=dropped)
     (out / "summary.json").write_text(json.dumps(result.as_dict(), indent=2) + "\n")
     draw_recall(out / "recall.png", result.kind.name, result.averages)
     return result
+
+
+def _speed(frames_per_second: float) -> str:
+    return f": {frames_per_second:,.0f} frames/s" if frames_per_second > 0.0 else ""
 
 
 def lines_of(result: TrackingEvaluation) -> list[str]:
@@ -215,7 +242,7 @@ def lines_of(result: TrackingEvaluation) -> list[str]:
         rows.append([overlap, *(f"{v:.2f}" if isinstance(v := scores[name], float) else str(v) for name in names)])
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return [
-        f"{result.kind.name}, sequences {' '.join(result.sequences)}: {result.frames_per_second:,.0f} frames/s",
+        f"{result.kind.name}, sequences {' '.join(result.sequences)}" + _speed(result.frames_per_second),
         *("  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
         f"HOTA {100 * result.hota.hota:.2f}, DetA {100 * result.hota.detection:.2f}, "
         f"AssA {100 * result.hota.association:.2f}, of the tracks with the highest MOTA at 0.5",
