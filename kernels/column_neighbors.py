@@ -16,7 +16,7 @@ FORWARD = 12
 LIST_NEIGHBORS = """
     // Of the columns begin … end − 1 the neighbours among them, 12 each, −1 where there is none.
     const auto list_neighbors = [&](const int begin, const int end, int* __restrict neighbors) {
-        const vec4i* __restrict column = columns.data;
+        const wp::vec4i* __restrict column = columns.data;
         const long long row_length = (long long)layout.depth + 4;  // two columns free on either side
         const long long rows = (long long)layout.levels * (layout.width + 2);
         if (layout.high_digits > 0 && rows * row_length <= column_map.shape[0]) {

@@ -343,7 +343,10 @@ class VoxelDownsample:
             elif random:
                 keep("_keys", wp.full(slots, 2**63 - 1, dtype=wp.int64, device=device))
         elif centroids:
-            keep("_summed", VoxelSums(self.capacity, self.parts or parts_for(self.capacity, _LEAST_PART), device))
+            parts = self.parts or parts_for(self.capacity, _LEAST_PART)
+            numbers = (self._grid.inverse_size, self._grid.limit, self._grid.scale)
+            results = [self.centroids, self.centroid_count, self.dropped]
+            keep("_summed", VoxelSums(self.capacity, parts, device, numbers, *results))
         else:
             buffers(self.capacity, wp.vec3i, "_cells")
             buffers(self.capacity, wp.int32, "_slots")
@@ -366,9 +369,7 @@ class VoxelDownsample:
         given, results = [xyz, count, self._grid], [self.centroids, self.centroid_count]
         if self._sequential:
             if self.mode == "centroid":
-                grid = self._grid
-                given = (grid.inverse_size, grid.limit, grid.scale)
-                self._summed.launch(xyz, count, given, *results, self.dropped)
+                self._summed.launch(xyz, count)
             else:
                 workspace = [self._table, self._cells, self._slots, self._keys]
                 run(_choose_in_order, 1, given, [*workspace, self.chosen, *results, self.dropped])

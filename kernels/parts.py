@@ -5,15 +5,15 @@ Results never depend on the cut: a part by points writes places of its own, a pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
 
 from .device import DEFAULT_DEVICE
-from .threads import launch_parts, thread_count
+from .threads import PackedLaunch, thread_count
 
-__all__ = ["first_row_of", "part_start", "parts_for", "run_parts"]
+__all__ = ["first_row_of", "packed_parts", "part_start", "parts_for", "run_parts"]
 
 
 def parts_for(capacity: int, least: int) -> int:
@@ -71,8 +71,23 @@ def run_parts(kernel: Any, parts: int, device: str, inputs: Sequence[Any], outpu
         inputs: The parameters that follow.
         outputs: Those that it writes.
     """
+    packed_parts(kernel, parts, device, inputs, outputs)()
+
+
+def packed_parts(
+    kernel: Any, parts: int, device: str, inputs: Sequence[Any], outputs: Sequence[Any] = ()
+) -> Callable[..., None]:
+    """The same as a function, to be called often: on a CPU it packs the parameters once.
+
+    It takes those that change, and are None at first, by name.
+    """
     if device == DEFAULT_DEVICE:
-        launch_parts(kernel, parts, inputs, outputs)
-        return
-    for part in range(parts):
-        wp.launch(kernel, 1, inputs=[part, parts, *inputs], outputs=list(outputs), device=device)
+        return PackedLaunch(kernel, parts, inputs, outputs).launch
+    names = [argument.label for argument in kernel.adj.args[2:]]
+
+    def launch(**changed: Any) -> None:
+        given = [changed.get(name, value) for name, value in zip(names, [*inputs, *outputs], strict=True)]
+        for part in range(parts):
+            wp.launch(kernel, 1, inputs=[part, parts, *given], device=device)
+
+    return launch

@@ -182,7 +182,7 @@ class PackedLaunch:
         self._kernel, self._parts = kernel, parts
         self._given = [*inputs, *outputs]
         self._own = 0 if parts is None else 2  # parameters before those given
-        self._index = {argument.label: index for index, argument in enumerate(kernel.adj.args)}
+        self._index: dict[str, int] = {}
         self._commands: list[Any] = []
         self._device = wp.get_device(DEFAULT_DEVICE)
 
@@ -192,6 +192,8 @@ class PackedLaunch:
         Args:
             **changed: Parameters by name, in place of what was last given.
         """
+        if changed and not self._index:
+            self._index = {argument.label: index for index, argument in enumerate(self._kernel.adj.args)}
         places = {self._index[name]: value for name, value in changed.items()}
         if self._device.is_capturing or not self._commands:
             given = list(self._given)

@@ -9,11 +9,9 @@ A voxel is one row, one cache line, of 64-bit numbers: cell x and y, cell z and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import warp as wp
 
-from .parts import part_start, run_parts
+from .parts import packed_parts, part_start
 
 __all__ = ["VoxelSums"]
 
@@ -243,54 +241,57 @@ def _write_part(
     _write_centroids(part, parts, rows_in, first_in, voxels_in, scale, table, centroids_out, centroid_count_out)
 
 
-@dataclass(frozen=True)
 class VoxelSums:
     """Workspace to sum the voxels of clouds of up to `capacity` points, cut into `parts`, at most 64."""
 
-    capacity: int
-    parts: int
-    device: str
-
-    def __post_init__(self):
-        def buffer(name: str, shape: int | tuple[int, ...], dtype: type = wp.int32) -> None:
-            object.__setattr__(self, name, wp.empty(shape, dtype=dtype, device=self.device))
-
-        slots = max(64, 2 << (self.capacity - 1).bit_length())
-        buffer("_cells", self.capacity, wp.vec3i)
-        buffer("_slots", self.capacity)
-        buffer("_table", (self.parts, slots))
-        self._table.fill_(-1)
-        # Whose a point is, is not known before: memory that is not used is not there either.
-        buffer("_rows", (self.parts, self.capacity, 8), wp.int64)
-        buffer("_own", (self.parts, self.capacity))
-        buffer("_first", (self.parts, self.capacity))
-        buffer("_voxels", self.parts)
-
-    def launch(
+    def __init__(
         self,
-        xyz: wp.array,
-        count: wp.array,
+        capacity: int,
+        parts: int,
+        device: str,
         grid: tuple[float, float, float],
         centroids: wp.array,
         centroid_count: wp.array,
         dropped: wp.array,
-    ) -> None:
-        """Fills `centroids` and the counts; `grid` is 1 / the edge of a voxel, the reach, the integers per metre."""
+    ):
+        """Makes it to fill `centroids` and the counts.
+
+        Args:
+            capacity: Points that one launch can take.
+            parts: Into how many the work is cut.
+            device: A Warp device.
+            grid: 1 / the edge of a voxel, the reach, the integers per metre.
+            centroids: Shape (capacity,), vec3.
+            centroid_count: Shape (1,), int32.
+            dropped: Shape (1,), int32: points out of reach.
+        """
+
+        def buffer(shape: int | tuple[int, ...], dtype: type = wp.int32) -> wp.array:
+            return wp.empty(shape, dtype=dtype, device=device)
+
         inverse_size, limit, scale = grid
-        parts, device = self.parts, self.device
-        given = [xyz, count, inverse_size, limit, self._table.shape[1]]
-        run_parts(_find_cells_of_part, parts, device, given, [self._cells, self._slots])
-        run_parts(
+        slots = max(64, 2 << (capacity - 1).bit_length())
+        cells, first_slots = buffer(capacity, wp.vec3i), buffer(capacity)
+        table = wp.full((parts, slots), -1, dtype=wp.int32, device=device)
+        # Whose a point is, is not known before: memory that is not used is not there either.
+        rows = buffer((parts, capacity, 8), wp.int64)
+        own, first, voxels = buffer((parts, capacity)), buffer((parts, capacity)), buffer(parts)
+        self._find_cells = packed_parts(
+            _find_cells_of_part, parts, device, [None, None, inverse_size, limit, slots], [cells, first_slots]
+        )
+        self._sum = packed_parts(
             _sum_part,
             parts,
             device,
-            [xyz, count, self._cells, self._slots, scale],
-            [self._table, self._rows, self._own, self._first, self._voxels, dropped],
+            [None, None, cells, first_slots, scale],
+            [table, rows, own, first, voxels, dropped],
         )
-        run_parts(
-            _write_part,
-            parts,
-            device,
-            [self._rows, self._first, self._voxels, scale],
-            [self._table, centroids, centroid_count],
+        self._write = packed_parts(
+            _write_part, parts, device, [rows, first, voxels, scale], [table, centroids, centroid_count]
         )
+
+    def launch(self, xyz: wp.array, count: wp.array) -> None:
+        """Sums the first `count[0]` points."""
+        self._find_cells(xyz_in=xyz, count_in=count)
+        self._sum(xyz_in=xyz, count_in=count)
+        self._write()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warploom.kernels.threads import launch_parts, run_together, set_thread_count, thread_count
+from warploom.kernels.threads import PackedLaunch, launch_parts, run_together, set_thread_count, thread_count
 
 
 @wp.kernel
@@ -26,6 +26,11 @@ def _square_part(
     n = values_in.shape[0]
     for i in range(n * part / parts, n * (part + 1) / parts):
         squares_out[i] = values_in[i] * values_in[i]
+
+
+@wp.kernel
+def _add(number: int, counter: wp.array(dtype=wp.int32)):
+    counter[0] = counter[0] + number
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
@@ -50,6 +55,41 @@ def test_a_capture_records_every_part():
     wp.capture_launch(capture.graph)
 
     np.testing.assert_array_equal(squares.numpy(), values**2)
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_packed_launch_takes_what_changes(parts):
+    squares = wp.zeros(1000, dtype=wp.int32, device="cpu")
+    launch = PackedLaunch(_square_part, parts, [None], [squares])
+    for length in (1000, 700, 3):
+        values = np.arange(length, dtype=np.int32) + length
+        squares.fill_(-1)
+
+        launch.launch(values_in=wp.array(values, device="cpu"))
+
+        np.testing.assert_array_equal(squares.numpy()[:length], values**2)
+        assert (squares.numpy()[length:] == -1).all()
+    other = wp.zeros(1000, dtype=wp.int32, device="cpu")
+    launch.launch(values_in=wp.array(np.arange(9, dtype=np.int32), device="cpu"), squares_out=other)
+    assert other.numpy()[8] == 64
+
+
+def test_a_packed_launch_without_parts_and_in_a_capture():
+    counter = wp.zeros(1, dtype=wp.int32, device="cpu")
+    launch = PackedLaunch(_add, None, [None], [counter])
+    launch.launch(number=2)
+    launch.launch()
+    launch.launch(number=5)
+    assert counter.numpy()[0] == 9
+    with wp.ScopedCapture(device="cpu") as capture:
+        launch.launch(number=7)
+    assert counter.numpy()[0] == 9
+
+    wp.capture_launch(capture.graph)
+
+    assert counter.numpy()[0] == 16
+    with pytest.raises(KeyError, match="nothing"):
+        launch.launch(nothing=1)
 
 
 def test_calls_run_at_once():
