@@ -1,0 +1,193 @@
+"""`warploom eval detection` on a KITTI folder made here, where every figure is known, and on real scans."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from warploom.cli import app
+from warploom.components.evaluation.detection import evaluate_detection, write_summary
+from warploom.components.evaluation.detection_frames import evaluation_frames
+from warploom.components.evaluation.detection_report import write_report
+from warploom.components.evaluation.detection_reviews import Review
+from warploom.components.evaluation.kitti_objects import label_files, read_results, unpack_scan
+from warploom.errors import ConfigError, SourceError
+from warploom.models.classes import VEHICLE
+
+P = "721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003"
+CALIBRATION = (
+    "".join(f"P{k}: {P}\n" for k in range(4))
+    + "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
+)
+# type, x z in the camera's frame (right, forward); the bottom 1.65 m below it
+CARS = (("Car", 2.0, 12.0), ("Car", -3.0, 20.0), ("Van", 4.0, 30.0), ("Car", 30.0, 15.0))
+
+
+def row(kind, x, z, image="600 150 700 250", tail=""):
+    return f"{kind} 0.00 0 0.00 {image} 1.50 1.60 4.00 {x:.2f} 1.65 {z:.2f} 0.00{tail}"
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    """One scan: 30 points on each car, the last of which the camera does not see; and a folder of results."""
+    root = tmp_path / "set"
+    for name in ("velodyne", "label_2", "calib", "results"):
+        (root / name).mkdir(parents=True)
+    points = [(z + 0.27 + 0.02 * k, -x, -1.0, 0.5) for _, x, z in CARS for k in range(30)]
+    np.array(points, np.float32).tofile(root / "velodyne" / "000001.bin")
+    rows = [row(*car) for car in CARS] + [
+        "DontCare -1 -1 -10 50.00 100.00 400.00 300.00 -1 -1 -1 -1000 -1000 -1000 -10"
+    ]
+    (root / "label_2" / "000001.txt").write_text("\n".join(rows) + "\n")
+    (root / "calib" / "000001.txt").write_text(CALIBRATION)
+    found = [
+        row("Car", 2.3, 12.0, tail=" 0.9"), row("Car", -2.3, 20.0, tail=" 0.8"), row("Car", 4.0, 31.0, tail=" 0.7"),
+        row("Car", -1.0, 40.0, tail=" 0.6"), row("Car", -6.0, 11.0, tail=" 0.55"), row("Car", 0.0, 50.0, tail=" 0.2"),
+    ]  # fmt: skip
+    (root / "results" / "000001.txt").write_text("\n".join(found) + "\n")
+    return root
+
+
+def test_the_figures_are_those_worked_out_by_hand(kitti):
+    result = evaluate_detection([f"kitti:{kitti}"], kitti / "results", score=0.5, also=[0.1])
+    figures = result.sets["kitti"]
+    at = figures["at"]["0.5"]
+    assert at["tasks"]["cars within 1 m"] == {"objects": 3, "found": 2}
+    assert at["tasks"]["cars within 0.5 m"] == {"objects": 3, "found": 1}
+    assert at["tasks"]["vans within 1.5 m"] == {"objects": 1, "found": 1}
+    # The one 40 m ahead is false; the one in the DontCare area is not counted with it.
+    assert at["false_vehicles_per_frame"] == 1.0
+    assert at["and_in_dont_care_areas"] == 1.0
+    assert figures["at"]["0.1"]["false_vehicles_per_frame"] == 2.0
+    assert at["yaw_error_degrees"]["median"] == pytest.approx(0.0, abs=0.01)
+    assert figures["recall"]["vehicle"]["by_range"][1] == {"low": 10.0, "high": 20.0, "objects": 1, "found": 1}
+    assert figures["kitti_ap_r40"]["Car"]["3d"]["easy"]["objects"] == 3
+    assert [each.frame for each in result.false] == ["set/000001"]
+    assert result.false[0].score == pytest.approx(0.6)
+
+
+def test_a_reviewed_vehicle_is_not_false(kitti, tmp_path):
+    review = tmp_path / "reviewed.yaml"
+    review.write_text("- {frame: set/000001, at: [40.5, 1.0], note: parked behind the hedge}\n")
+    result = evaluate_detection([f"kitti:{kitti}"], kitti / "results", score=0.5, review=Review.read(review))
+    at = result.sets["kitti"]["at"]["0.5"]
+    assert (at["false_vehicles_per_frame"], at["reviewed_as_real"]) == (0.0, 1)
+    for text in ("- {frame: x}", "frame: x", "- [", "- {frame: x, at: [1]}"):
+        review.write_text(text)
+        with pytest.raises(ConfigError, match=r"reviewed\.yaml"):
+            Review.read(review)
+
+
+def test_summary_and_report_hold_what_was_found(kitti, tmp_path):
+    result = evaluate_detection([f"kitti:{kitti}"], kitti / "results", score=0.5)
+    write_summary(result, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["sets"]["kitti"]["frames"] == 1
+    assert summary["false_vehicles"][0]["frame"] == "set/000001"
+    page = write_report(result, tmp_path / "out").read_text()
+    assert "cars within 1 m" in page
+    assert "{frame: set/000001, at: [40.3, 1.0]}" in page
+    assert sorted(path.name for path in (tmp_path / "out" / "pictures").iterdir()) == ["false_001.png", "scan_001.png"]
+
+
+def test_the_command_scores_result_files(kitti, tmp_path):
+    run = CliRunner().invoke(
+        app,
+        ["eval", "detection", "--data", f"kitti:{kitti}", "--detections", str(kitti / "results"), "--score", "0.5",
+         "--out", str(tmp_path / "out")],
+    )  # fmt: skip
+    assert run.exit_code == 0, run.output
+    assert "cars within 1 m                    2/3" in run.output
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_damaged_data_are_named(kitti):
+    labels = kitti / "label_2" / "000001.txt"
+    whole = labels.read_text()
+    for text, message in (
+        ("Car 1 2\n", "line 1: not a KITTI label"),
+        (whole.replace("2.00 1.65", "x 1.65"), "not KITTI"),
+    ):
+        labels.write_text(text)
+        with pytest.raises(SourceError, match=message):
+            list(evaluation_frames(f"kitti:{kitti}"))
+    (kitti / "packed.npz").write_bytes(b"PK")
+    with pytest.raises(SourceError, match="not a packed scan"):
+        unpack_scan(kitti / "packed.npz")
+    labels.write_text(whole)
+    with pytest.raises(SourceError, match="cannot read the labels"):
+        read_results(kitti / "none.txt", label_files(kitti)[0][1]().calibration)
+
+
+@pytest.mark.parametrize(
+    ("uri", "error", "message"),
+    [
+        ("kitti", ConfigError, "expected one of kitti:"),
+        ("lyft:x", ConfigError, "expected one of kitti:"),
+        ("kitti:", ConfigError, "nothing after kitti:"),
+        ("kitti:/nowhere?speed=3", ConfigError, "unknown key 'speed'"),
+        ("kitti:/nowhere?every=0", ConfigError, "every is '0'"),
+        ("kitti:/nowhere", SourceError, "no labelled sequence"),
+        ("sim:scenes?seeds=9-3", ConfigError, "seeds is '9-3'"),
+        ("sim:scenes?seeds=1000000-1000001", ConfigError, "are trained on"),
+        ("sim:mars", ConfigError, "scenario must be one of"),
+        ("nuscenes:/nowhere", SourceError, "No such file"),
+        ("range:/nowhere", SourceError, "no range images"),
+        ("range:/nowhere?labels=x", ConfigError, "labels must be one of"),
+    ],
+)
+def test_what_makes_no_sense_is_said(uri, error, message):
+    with pytest.raises(error, match=message):
+        list(evaluation_frames(uri))
+
+
+def test_simulated_scenes_come_with_their_truth():
+    scenes = list(evaluation_frames("sim:scenes?seeds=500&lidar=vlp16"))
+    assert [scene.name for scene in scenes] == ["scene 500"]
+    assert all(len(scene.boxes) == len(scene.types) == len(scene.counts) > 0 for scene in scenes)
+    assert all(1.0 < scene.sensor_height < 3.0 for scene in scenes)
+
+
+@pytest.mark.real
+def test_real_scans_have_as_many_objects_as_are_known(shared_data):
+    """41 cars with 20 points within 40 m, and 36 vans, in the 29 scans that heads are judged on."""
+    uris = (f"kitti:{shared_data}/kitti_object", f"kitti:{shared_data}/kitti_tracking?sequence=0000&every=5")
+    frames = [frame for uri in uris for frame in evaluation_frames(uri)]
+    assert len(frames) == 29
+    counts = dict.fromkeys(("Car", "Van"), 0)
+    for frame in frames:
+        near = (frame.counts >= 20) & (np.hypot(*frame.boxes[:, :2].T) < 40)
+        for kind in counts:
+            counts[kind] += int((near & (np.array(frame.types, object) == kind)).sum())
+    assert counts == {"Car": 41, "Van": 36}
+
+
+@pytest.mark.real
+def test_reference_detections_find_the_cars(shared_data):
+    """OpenPCDet's PointPillars, trained on such frames: nine in ten near cars within 1 m."""
+    folder = shared_data / "kitti_object" / "ref_openpcdet_pointpillars"
+    frames = [
+        f for f in evaluation_frames(f"kitti:{shared_data}/kitti_object") if (folder / f"{f.name[-6:]}.txt").exists()
+    ]
+    assert len(frames) == 4
+    found = total = 0
+    for frame in frames:
+        boxes, scores, types = read_results(folder / f"{frame.name[-6:]}.txt", frame.kitti.calibration)
+        near = (frame.counts >= 20) & (np.hypot(*frame.boxes[:, :2].T) < 40) & (frame.classes == VEHICLE)
+        cars = frame.boxes[near & (np.array(frame.types, object) == "Car")]
+        own = boxes[(np.array(types, object) == "Car") & (scores > 0.3)]
+        found += sum(np.hypot(*(own[:, :2] - car[:2]).T).min() < 1.0 for car in cars)
+        total += len(cars)
+    assert total >= 6
+    assert found >= 0.9 * total
+
+
+@pytest.mark.real
+def test_a_nuscenes_frame_is_turned_to_look_forward(shared_data):
+    (frame,) = evaluation_frames(f"nuscenes:{shared_data}/nuscenes_sample")
+    assert len(frame.boxes) == 69
+    from warploom.models.geometry import points_in_boxes
+
+    inside = points_in_boxes(frame.points, frame.boxes, margin=0.05).sum(axis=1)
+    assert np.corrcoef(inside, frame.counts)[0, 1] > 0.95
