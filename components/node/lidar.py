@@ -11,7 +11,7 @@ import logging
 import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -55,6 +55,8 @@ class LidarDriver(Component):
 
     Config = LidarDriverConfig
     context: ExecutionContext | None
+    stop_timeout_s: ClassVar[float] = 3.0
+    """How long a stop waits for a frame that is being made."""
 
     cloud: Output[SensorFrame]
 
@@ -97,12 +99,15 @@ class LidarDriver(Component):
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends it, at the latest when a frame that is being made is done."""
+        """Ends it. A source that is just being opened cannot be interrupted: it is left to itself, and counted."""
         self._stopping.set()
         self._tick.set()
         thread, self._thread = self._thread, None
         if thread is not None:
-            thread.join()
+            thread.join(self.stop_timeout_s)
+            if thread.is_alive():
+                _log.warning("%s: %s is still being opened since the stop, and is left to itself", self.name, self._uri)
+                self.losses.count(self.name, "hung")
         self._phase = "stopped"
 
     @property
@@ -127,6 +132,8 @@ class LidarDriver(Component):
             self._phase = "making frames"
             frames = self._frames()
             frame = next(frames, None)
+            if self._stopping.is_set():
+                return
             self._phase = "playing"
             due = self.clock.monotonic_ns()
             index = 0

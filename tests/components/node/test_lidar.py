@@ -158,6 +158,30 @@ def test_it_can_be_stopped_while_it_waits_and_leaves_no_thread(drive):
     assert driver.state()["phase"] == "stopped"
 
 
+def test_a_source_that_takes_for_ever_to_open_does_not_hold_up_the_stop(monkeypatch, caplog):
+    opening, opened = threading.Event(), threading.Event()
+
+    def slow(uri, device=None):
+        opening.set()
+        opened.wait(30)
+        return iter(())
+
+    monkeypatch.setattr("warploom.components.sources.open_source", slow)
+    monkeypatch.setattr(LidarDriver, "stop_timeout_s", 0.01)
+    mesh = DataMesh()
+    driver = LidarDriver("driver", ExecutionContext())
+    driver.bind(mesh, {"cloud": "raw"})
+    driver.init(LidarDriverConfig(sensor="roof"))
+    driver.start()
+    assert opening.wait(10)
+    driver.stop()
+    assert mesh.losses["driver", "hung"] == 1
+    assert "left to itself" in caplog.text
+    opened.set()
+    until(lambda: not [thread for thread in threading.enumerate() if thread.name == "driver"])
+    assert driver.state()["phase"] == "stopped", "what ends later does not say so"
+
+
 def test_what_plays_the_sensor_comes_from_the_profile_and_nothing_is_opened(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("nothing may be opened before the start")
