@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from warploom.bench.contest import peer, record_figure
+from warploom.bench.dora_peer import send_by_dora
 from warploom.bench.transport_peers import WAYS, send_all
 
 SIZES = {"1 kB": 1_000, "100 kB": 100_000, "2 MB": 2_000_000, "20 MB": 20_000_000}
@@ -12,16 +13,22 @@ EVERY = 4e-3  # [s] between data, so that the receiver sleeps when one comes
 GOAL = 200.0  # [µs] of the median, whatever the size
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", [*WAYS, "dora-rs"])
 @pytest.mark.parametrize("size", SIZES)
 def bench_transport(benchmark, monkeypatch, tmp_path, size, way):
     """Sends data of one size by one way; the receiver sleeps in between, as between frames of a sensor."""
-    if WAYS[way].package:
-        peer(WAYS[way].package)
+    package = "dora" if way == "dora-rs" else WAYS[way].package
+    if package:
+        peer(package)
     monkeypatch.setenv("WARPLOOM_RUN", str(tmp_path))
     taken = []
     benchmark.extra_info.update(kernel="transport", on=f"{COUNT} of {size}")
-    benchmark.pedantic(lambda: taken.append(send_all(way, SIZES[size], COUNT, EVERY)), rounds=1)
+
+    def send():
+        arguments = SIZES[size], COUNT, EVERY
+        taken.append(send_by_dora(*arguments) if way == "dora-rs" else send_all(way, *arguments))
+
+    benchmark.pedantic(send, rounds=1)
     published, begun = (taken[0] / 1e3).T
     goal = GOAL if way == "warploom" else None
     note = f"best {published.min():.0f}, p99 {np.percentile(published, 99):.0f}; {len(published)} of {COUNT} arrived"
