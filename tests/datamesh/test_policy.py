@@ -163,6 +163,8 @@ def test_reorder_holds_no_longer_than_its_delay():
     assert topic.told == [10, 20]
     topic.clock.advance(1)
     assert topic.told == [10, 20, 30]
+    stamps = [topic.window.snapshot().entry(index).committed_ns for index in range(3)]
+    assert stamps == [100, 100, 200], "the time that a datum was held counts as latency"
 
 
 def test_reorder_drops_what_comes_later_than_it_held():
