@@ -8,6 +8,7 @@ import pytest
 from warploom.datamesh.transport import exported_topics, reap, run_folder
 
 CLOUD = 2_000_000
+LIFE = 10_000_000  # versions from the beginning of one life to that of the next: more than it can commit
 
 
 def descriptors(pid):
@@ -59,11 +60,11 @@ def kill_writers(peer, times):
     before = None
     for life in range(times):
         # Every third life begins anew at low versions, the others go on.
-        first = 1 if life % 3 == 2 else 1000 * (life + 1)
+        first = 1 if life % 3 == 2 else LIFE * (life + 1)
         writer = peer("write", "writer", "cloud", first, CLOUD, 1, 100_000)
         writer.wait_for("ready")
         got = orders(read_on(reader))
-        while got[0][1] < first or got[0][1] >= first + 900:  # of the life before
+        while not first <= got[0][1] < first + LIFE:  # of the life before
             got = orders(read_on(reader))
         assert got[0] > last
         time.sleep(0.001 * (life % 7))
