@@ -1,0 +1,120 @@
+"""Detection heads on one frame: ours in floating point and in eight bits, beside KITTI's PointPillars.
+
+From points to boxes for the heads; the peer is PointPillars' backbone alone (4.8 M parameters, random weights, as the
+time does not depend on them), without making pillars or reading boxes. All run in ONNX Runtime with two threads.
+"""
+
+import numpy as np
+import pytest
+
+from warploom.bench.contest import Contender, peer
+from warploom.bench.scans import REAL
+from warploom.models.head import DetectionHead
+from warploom.models.network import Network
+
+CLOUDS = ("street 120k", REAL)
+BACKBONE, HEAD, EIGHT_BITS = "PointPillars backbone (fp32)", "warploom head", "warploom head, 8 bits"
+_HEIGHT, _THREADS = 1.73, 2
+
+
+def backbone(folder):
+    """PointPillars' two-dimensional part for KITTI: 64 x 496 x 432 to scores, residuals and directions."""
+    torch = peer("torch")
+    from warploom.models.importers.pointpillars import PointPillarsNet, PointPillarsSpec
+
+    torch.manual_seed(0)
+    whole = PointPillarsNet(PointPillarsSpec()).eval()
+
+    class Backbone(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.whole = whole
+
+        def forward(self, x):
+            sides = []
+            for block, up in zip(self.whole.blocks, self.whole.ups, strict=True):
+                x = block(x)
+                sides.append(up(x))
+            x = torch.cat(sides, dim=1)
+            return self.whole.scores(x), self.whole.residuals(x), self.whole.directions(x)
+
+    path = folder / "backbone.onnx"
+    torch.onnx.export(
+        Backbone(), (torch.zeros(1, 64, 496, 432),), str(path), opset_version=17, dynamo=False,
+        input_names=["canvas"], output_names=["scores", "residuals", "directions"],
+    )  # fmt: skip
+    return path, sum(parameter.numel() for parameter in whole.parameters())
+
+
+@pytest.fixture(scope="session")
+def eight_bits(tmp_path_factory):
+    """The shipped head, quantised with scenes of the simulator."""
+    peer("onnx")
+    from warploom.components.evaluation.detection_frames import evaluation_frames
+    from warploom.models.card import DEFAULT_CARD
+    from warploom.models.quantization import quantize_head
+
+    scenes = evaluation_frames("sim:scenes?seeds=600-605&lidar=hdl64")
+    frames = ((scene.points, scene.sensor_height) for scene in scenes)
+    return quantize_head(DEFAULT_CARD, tmp_path_factory.mktemp("eight"), frames)
+
+
+def found(result):
+    return f"{len(result)} objects"
+
+
+def agreement(card, points):
+    """How far a variant's boxes are from those of the shipped head, at the card's score."""
+    ours, other = DetectionHead(threads=_THREADS), DetectionHead(card, threads=_THREADS)
+    a, b = ours.detect_points(points, _HEIGHT), other.detect_points(points, _HEIGHT)
+    if not len(a) or not len(b):
+        return f"{len(b)} of {len(a)} objects"
+    apart = np.linalg.norm(a.boxes[:, None, :2] - b.boxes[None, :, :2], axis=2).min(axis=1)
+    return f"{(apart < 0.5).sum()} of {len(a)} objects within 0.5 m, {len(b)} in all"
+
+
+@pytest.mark.parametrize("who", [HEAD, EIGHT_BITS])
+@pytest.mark.parametrize("scan", CLOUDS)
+def bench_head(contest, who, scan, request):
+    points = contest.cloud(scan)
+    card = request.getfixturevalue("eight_bits") if who == EIGHT_BITS else None
+    said = agreement(card, points) if card else None
+
+    def call(device):
+        head = DetectionHead(card, device=device, threads=_THREADS)
+        head.warm_up()
+        return lambda: head.detect_points(points, _HEIGHT)
+
+    contest.run(
+        Contender(who), {who: call}, kernel="detection head", on=scan, size=len(points),
+        score=(lambda result: said) if said else found, threads={who: _THREADS},
+        how="points to boxes, 480 x 480 cells",
+    )  # fmt: skip
+
+
+def bench_pointpillars_backbone(contest, tmp_path):
+    path, parameters = backbone(tmp_path)
+    points = contest.cloud("street 120k")
+
+    def call(device):
+        import warp as wp
+
+        shapes = {"scores": 18, "residuals": 42, "directions": 12}
+        network = Network(
+            path,
+            {"canvas": (1, 64, 496, 432)},
+            {name: (1, channels, 248, 216) for name, channels in shapes.items()},
+            device=device,
+            threads=_THREADS,
+        )
+        network.bind_input("canvas", wp.zeros((1, 64, 496, 432), dtype=wp.float32, device=device))
+        kept = [wp.zeros((1, channels, 248, 216), dtype=wp.float32, device=device) for channels in shapes.values()]
+        for name, array in zip(shapes, kept, strict=True):
+            network.bind_output(name, array)
+        return lambda: (network.run(), kept)
+
+    contest.run(
+        Contender(BACKBONE), {BACKBONE: call}, kernel="detection head", on="street 120k", size=len(points),
+        score=lambda _: f"{parameters / 1e6:.1f} M parameters", threads={BACKBONE: _THREADS},
+        how="points to boxes, 480 x 480 cells",
+    )  # fmt: skip
