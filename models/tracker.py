@@ -206,8 +206,9 @@ class Tracker:
             version, self._count, n, self._next_id, self._frames, in_order, self.config.max_tracks,
         )  # fmt: skip
         if in_order:
-            along = boxes[:, :3] @ step.frame_real[6:9] + step.frame_real[9]
-            step.frame_real[5] = np.nanmax(boxes[:, 3:6].prod(1), initial=0.0)
+            with np.errstate(invalid="ignore", over="ignore"):  # of detections of no use
+                along = boxes[:, :3] @ step.frame_real[6:9] + step.frame_real[9]
+                step.frame_real[5] = np.nanmax(boxes[:, 3:6].prod(1), initial=0.0)
             step.order[:n] = np.argsort(along, kind="stable")
             step.send("order")
         step.send("given", "given_whole", "frame_real", "frame_whole")

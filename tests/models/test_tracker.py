@@ -388,3 +388,39 @@ def test_same_frames_same_bytes_and_inputs_stay(seed, n, with_pose):
 def test_configuration_needs_every_class():
     with pytest.raises(ValueError, match="classes has 1 entries"):
         TrackerConfig(classes=(ClassConfig(),))
+
+
+def test_gaps_and_missing_poses_are_counted():
+    tracker = Tracker()
+    for frame in (0, 1, 2, 3, 90):
+        step(tracker, frame, [car(0, 0)], pose=None if frame == 2 else np.eye(4))
+    assert tracker.incidents == {"gap": 1, "pose missing": 1}
+
+
+def test_five_thousand_in_one_place_are_tracked_and_what_was_cut_short_is_counted():
+    rng, tracker = np.random.default_rng(6), Tracker()
+    for frame in range(2):
+        boxes = np.tile(CAR, (5000, 1))
+        boxes[:, :2] = rng.normal(0, 1.0, (5000, 2))
+        boxes[::50] = np.nan
+        tracks = step(tracker, frame, boxes, pose=np.eye(4))
+    assert tracker.incidents["cut short"] == 1  # nothing is assigned in the first frame
+    assert tracker.dropped == {"not finite": 200}
+    taken = tracks.detections[tracks.detections >= 0]
+    assert len(set(taken.tolist())) == len(taken) > 4000
+    assert np.isfinite(tracks.boxes).all()
+
+
+def test_detections_of_no_use_do_not_disturb_the_order_of_many():
+    """From 256 on detections are looked up along x, whatever stands in between."""
+    rng, clean, dirty = np.random.default_rng(8), Tracker(), Tracker()
+    place = rng.uniform(-80, 80, (300, 2))
+    for frame in range(3):
+        boxes = np.tile(CAR, (300, 1))
+        boxes[:, :2] = place + rng.normal(0, 0.1, place.shape)
+        bad = boxes[::3].copy()
+        bad[0::3, 0], bad[1::3, 4], bad[2::3, 1] = np.nan, -1.0, np.inf
+        a, b = step(clean, frame, boxes), step(dirty, frame, np.concatenate([bad, boxes]))
+        np.testing.assert_array_equal(a.ids, b.ids)
+        np.testing.assert_array_equal(a.boxes, b.boxes)
+        np.testing.assert_array_equal(a.detections + len(bad), b.detections)
