@@ -183,7 +183,7 @@ class Importer:
             with self._lock:
                 self._socket = None
                 one.close()
-            if self._stopping.is_set():
+            if self._stopping.is_set() or isinstance(error, ConnectionError):  # it is gone again
                 return None
             if isinstance(error, TimeoutError):
                 raise SourceError(f"the process that exports {self._window.topic!r} does not answer") from None
