@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test check format bench train wheel clean
+.PHONY: demo test check format bench train wheel integrate clean
 
 demo: $(VENV)/.base
 	$(BIN)/warploom demo
@@ -33,6 +33,11 @@ train: $(VENV)/.dev
 
 wheel: $(VENV)/.dev
 	$(BIN)/python -m build --wheel --no-isolation --outdir dist .
+
+# A folder from which OUT/bin/start_all runs the node without the checkout.
+integrate: $(VENV)/.base
+	@test -n "$(OUT)" || { echo "make integrate OUT=DIR"; exit 2; }
+	$(BIN)/python -m warploom.components.integration $(OUT)
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

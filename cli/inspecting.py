@@ -35,10 +35,12 @@ def info(
 
 @commands.command()
 def check(
-    file: Annotated[str, typer.Argument(help="A profile or a module: the path of a YAML file, or a name.")],
+    file: Annotated[
+        str, typer.Argument(help="A profile, a module or a launch file: the path of a YAML file, or a name.")
+    ],
     settings: Settings = None,
 ) -> None:
-    """Validate a profile or a module file, with all that it names, without running it.
+    """Validate a profile, a module or a launch file, with all that it names, without running it.
 
     Example: `warploom check conf/modules/perception.yaml`
     """
@@ -50,11 +52,13 @@ def check(
 
 @commands.command()
 def graph(
-    file: Annotated[str, typer.Argument(help="A module or a profile: a YAML file, or a name.")] = "perception",
+    file: Annotated[
+        str, typer.Argument(help="A module, a profile or a launch file: a YAML file, or a name.")
+    ] = "perception",
     form: Annotated[str, typer.Option("--format", help="text, mermaid or svg.")] = "text",
     settings: Settings = None,
 ) -> None:
-    """Draw the components of a module file, or of all those of a profile, and the vertices of their graphs.
+    """Draw the components of a module, or all those of a profile or a launch file, and the vertices of their graphs.
 
     Example: `warploom graph perception --format svg > perception.svg`
     """
