@@ -5,13 +5,17 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 WORKERS ?= 2
 
-.PHONY: demo test check format bench train wheel integrate clean
+.PHONY: demo test campaign check format bench train wheel integrate clean
 
 demo: $(VENV)/.base
 	$(BIN)/warploom demo
 
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+# The long versions of tests: kills by the hundred.
+campaign: $(VENV)/.dev
+	$(BIN)/python -m pytest -m campaign
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from .kernels.roi import PolygonMask, in_polygons
     from .kernels.voxel import Voxelize, Voxels, voxelize
     from .kernels.voxel_map import VoxelMap
+    from .models.fusion import FusedObjects, Fusion, FusionConfig
     from .models.head import DetectionHead
     from .models.odometry import Odometry, OdometryConfig
     from .models.tracker import Tracker, TrackerConfig, Tracks
@@ -82,6 +83,7 @@ _HOMES = {
     "kernels.roi": ("PolygonMask", "in_polygons"),
     "kernels.voxel": ("Voxelize", "Voxels", "voxelize"),
     "kernels.voxel_map": ("VoxelMap",),
+    "models.fusion": ("FusedObjects", "Fusion", "FusionConfig"),
     "models.head": ("DetectionHead",),
     "models.odometry": ("Odometry", "OdometryConfig"),
     "models.tracker": ("Tracker", "TrackerConfig", "Tracks"),
@@ -103,6 +105,9 @@ __all__ = [
     "EuclideanCluster",
     "Filtered",
     "FitBoxes",
+    "FusedObjects",
+    "Fusion",
+    "FusionConfig",
     "GridCluster",
     "Ground",
     "GroundImage",

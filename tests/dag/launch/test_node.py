@@ -93,7 +93,7 @@ def kill_in_turn(node, chain_folder, times):
         assert len(supervisor.children(recursive=True)) == 3
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("times", [1, pytest.param(100, marks=pytest.mark.campaign)])
 def test_each_process_killed_in_turn_under_load_is_back_and_leaks_nothing(start, chain, tmp_path, times):
     node = start("launch", chain(period=10, size=100_000)).up()
     kill_in_turn(node, tmp_path, times)

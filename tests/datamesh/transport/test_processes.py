@@ -127,7 +127,7 @@ def test_whoever_is_killed_the_others_go_on(peer, who):
     CAMPAIGNS[who](peer, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("who", CAMPAIGNS)
 def test_whoever_is_killed_a_hundred_times_the_others_go_on(peer, who):
     CAMPAIGNS[who](peer, 100)
