@@ -58,6 +58,7 @@ class Trace:
         self._numbers_of: dict[tuple[int, int], int] = {}
         self._frames = 0
         self._on_way: set[tuple[int, int]] = set()
+        self._over: dict[tuple[int, int], None] = {}
         self._lost: dict[str, int] = {}
         self._numbers = 0
         self._unsubscribe: list[Callable[[], None]] = []
@@ -141,7 +142,7 @@ class Trace:
             yield from self._of_commit(*event, here=here)
         elif kind == "settle":
             topic, version, epoch, now = event
-            self._on_way.discard((epoch, version))
+            self._end((epoch, version))
             yield self._instant(f"nothing on {topic}", "settle", now, here, version)
             yield self._counter("frames on their way", now, {"frames": len(self._on_way)})
         else:
@@ -171,13 +172,28 @@ class Trace:
         # One nanosecond long: an arrow begins and ends at a slice, and this one must not reach into the next.
         yield {"name": f"commit {topic}", "cat": "commit", "ph": "X", "ts": stamp, "dur": 0.001, **here, "args": what}
         if last:
-            self._on_way.discard(frame)
+            self._end(frame)
             yield self._arrow(version, epoch, stamp, here, "f")
             yield self._counter(f"latency of {topic} [ms]", committed, {"ms": (committed - received) / 1e6})
         else:
-            self._on_way.add(frame)
+            self._begin(frame)
             yield self._arrow(version, epoch, stamp, here, "s")
         yield self._counter("frames on their way", committed, {"frames": len(self._on_way)})
+
+    def _begin(self, frame: tuple[int, int]) -> None:
+        # Who is started by the commit may be done with it before the thread that commits gets to say that it has.
+        if frame in self._over:
+            del self._over[frame]
+        else:
+            self._on_way.add(frame)
+
+    def _end(self, frame: tuple[int, int]) -> None:
+        if frame in self._on_way:
+            self._on_way.remove(frame)
+        else:
+            self._over[frame] = None
+            if len(self._over) > _REMEMBERED:
+                del self._over[next(iter(self._over))]
 
     def _arrow(self, version: int, epoch: int, stamp: float, here: dict[str, Any], phase: str) -> dict[str, Any]:
         # Versions are too large for the numbers of JSON, so the frames are numbered.

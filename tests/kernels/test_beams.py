@@ -15,6 +15,7 @@ def _uniforms(seed: wp.uint32, out: wp.array2d(dtype=wp.float32)):
 
 @wp.kernel
 def _rays(
+    world: int,
     beams: wp.array(dtype=wp.vec3),
     fraction: wp.array(dtype=wp.float32),
     pose: wp.array(dtype=wp.transform),
@@ -22,7 +23,7 @@ def _rays(
     direction: wp.array(dtype=wp.vec3),
 ):
     i = wp.tid()
-    o, d = ray_of(i, beams, fraction, pose)
+    o, d = ray_of(i, world, beams, fraction, pose)
     origin[i] = o
     direction[i] = d
 
@@ -58,7 +59,7 @@ def test_chance_is_even():
 
 
 def test_rays_turn_and_move_with_the_sensor():
-    """Beside SciPy's slerp: within 1e-4, of a turn of 6° in a sweep."""
+    """Beside SciPy's slerp, in the second of two worlds: within 1e-4, of a turn of 6° in a sweep."""
     random = np.random.default_rng(1)
     n = 100
     beams = random.normal(size=(n, 3))
@@ -66,9 +67,10 @@ def test_rays_turn_and_move_with_the_sensor():
     fraction = np.linspace(0, 1, n)
     turns = Rotation.from_rotvec([[0.1, 0.2, 0.3], [0.1, 0.2, 0.4]])
     places = np.array([[1.0, 2.0, 3.0], [1.8, 2.1, 3.0]])
-    pose = wp.array(np.c_[places, turns.as_quat()].astype(np.float32), dtype=wp.transform)
+    poses = np.c_[places, turns.as_quat()]
+    pose = wp.array(np.r_[poses[::-1] + 1.0, poses].astype(np.float32), dtype=wp.transform)
     got = [wp.zeros(n, dtype=wp.vec3) for _ in range(2)]
-    inputs = [wp.array(beams, dtype=wp.vec3), wp.array(fraction, dtype=wp.float32), pose]
+    inputs = [1, wp.array(beams, dtype=wp.vec3), wp.array(fraction, dtype=wp.float32), pose]
     wp.launch(_rays, n, inputs=inputs, outputs=got)
     assert np.abs(got[0].numpy() - (places[0] + fraction[:, None] * (places[1] - places[0]))).max() < 1e-5
     expected = Slerp([0.0, 1.0], turns)(fraction).apply(beams)

@@ -27,9 +27,9 @@ def test_without_restarts_the_first_death_is_the_end():
 
 
 @given(
-    deaths=st.lists(st.floats(0.0, 100.0), min_size=1, max_size=60),
+    deaths=st.lists(st.integers(0, 100), min_size=1, max_size=60),  # whole seconds, whose differences are exact
     limit=st.integers(0, 10),
-    window=st.floats(0.1, 50.0),
+    window=st.integers(1, 50),
     factor=st.floats(1.0, 100.0),
 )
 def test_never_more_restarts_within_the_window_than_the_limit(deaths, limit, window, factor):

@@ -23,7 +23,7 @@ def until(condition, what="it"):
     """Waits until a condition holds; fails when it does not in a long time."""
     end = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
+        assert time.monotonic() < end, f"waited {PATIENCE} s for {what() if callable(what) else what}"
         time.sleep(0.002)
 
 
@@ -68,7 +68,7 @@ class Side:
     wait = staticmethod(until)
 
     def until(self, condition, topic, what=None):
-        until(lambda: condition(self.counts(topic)), what or f"{topic}: {self.counts(topic)}")
+        until(lambda: condition(self.counts(topic)), what or (lambda: f"{topic}: {self.counts(topic)}"))
 
 
 @pytest.fixture
