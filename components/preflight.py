@@ -126,12 +126,13 @@ def check_models(plan: LaunchPlan) -> Iterator[Finding]:
     file = _profile_of(plan)
     if file is None:
         return
-    from ..models.card import DEFAULT_CARD, load_card
+    from ..models.card import DEFAULT_CARD
+    from ..models.heads import read_card
 
     named = file.content.models.detector
     card = DEFAULT_CARD if named is None else file.path.parent / named
     try:
-        loaded, model = load_card(card)
+        loaded, model = read_card(card)
     except ModelError as error:
         way_out = (
             "reinstall warploom: its own model is damaged" if named is None
