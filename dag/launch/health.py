@@ -72,6 +72,7 @@ class ProcessObserver:
                 "kind": _kind(component),
                 "inputs": {h.topic: type_name(h.payload) for h in component.inputs.values()},
                 "outputs": {h.topic: type_name(h.payload) for h in component.outputs.values()},
+                "homes": {h.topic: getattr(h.payload, "__module__", None) for h in component.outputs.values()},
             }
         return components
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import importlib
 import queue
 import time
 from collections import deque
@@ -19,6 +21,14 @@ __all__ = ["RateMeter", "listen", "plain_value"]
 _SHOWN_ITEMS = 16
 _SHOWN_TEXT = 400
 _DEPTH = 6
+
+
+def _register_message(client: ControlClient, topic: str) -> None:
+    """Imports the module that defines a topic's message, which is needed to read it, where it can be found here."""
+    for one in client.ask("topics")["topics"]:
+        if one["topic"] == topic and one.get("home"):
+            with contextlib.suppress(ImportError):  # what cannot be read is told when it comes
+                importlib.import_module(one["home"])
 
 
 def listen(
@@ -48,6 +58,7 @@ def listen(
     """
     from .linking import LinkPlan, Links
 
+    _register_message(client, topic)
     client.ask("export", topic=topic)
     began = time.perf_counter_ns()  # the same clock in all processes of a host
     # Few versions, so that the producer has its memory back soon.

@@ -92,6 +92,7 @@ def topic_status(supervisor: Supervisor) -> dict[str, Any]:
                 entry.update(
                     producer=f"{process.name}/{name}",
                     type=kind,
+                    home=component.get("homes", {}).get(topic),
                     commits=commits.get(topic, 0),
                     rate_hz=rates.get(topic, 0.0),
                 )

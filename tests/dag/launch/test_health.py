@@ -128,4 +128,5 @@ def test_the_description_names_components_topics_and_types(process):
         "kind": "Doubler",
         "inputs": {"ticks": "ndarray"},
         "outputs": {"doubled": "ndarray"},
+        "homes": {"doubled": "numpy"},
     }
