@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -179,6 +179,16 @@ class Obstacle(NamedTuple):
     """`foreground`: a known class; `background`: a cluster of points."""
 
 
+class _Found(Protocol):
+    """What a tracker or a fusion gives, as `models.tracker.Tracks`."""
+
+    ids: np.ndarray
+    boxes: np.ndarray
+    velocities: np.ndarray
+    classes: np.ndarray
+    background: np.ndarray
+
+
 @message("warploom.Obstacles")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Obstacles:
@@ -206,6 +216,45 @@ class Obstacles:
     """True for an obstacle of no known class, from a cluster, shape (k,), bool."""
     missing_inputs: tuple[str, ...] = field(default=())
     """Inputs that this frame had to do without."""
+
+    @classmethod
+    def of_frame(
+        cls,
+        detected: DetectedObjects,
+        found: _Found,
+        *,
+        rows: np.ndarray,
+        scores: np.ndarray,
+        missing: tuple[str, ...] = (),
+    ) -> Obstacles:
+        """The objects that a tracker made of a frame's detections.
+
+        A cluster is as large as what is seen of it now: its track gives it an id, and its own box stays.
+
+        Args:
+            detected: The frame and its detections.
+            found: The k objects.
+            rows: The detection of each, −1 for none, shape (k,).
+            scores: Confidence of each in [0, 1], shape (k,).
+            missing: Inputs that were missing besides those that `detected` names.
+        """
+        sensor = detected.sensor
+        boxes = found.boxes.astype(np.float32)
+        seen = found.background & (rows >= 0)
+        boxes[seen] = detected.detections.boxes[rows[seen]]
+        return cls(
+            version=sensor.version,
+            frame=sensor.index,
+            frame_id=sensor.frame_id,
+            velocity_reference="ego" if sensor.pose is None else "world",
+            ids=found.ids,
+            classes=found.classes,
+            scores=scores.astype(np.float32),
+            boxes=boxes,
+            velocities=found.velocities.astype(np.float32),
+            background=found.background,
+            missing_inputs=(*detected.missing_inputs, *missing),
+        )
 
     @classmethod
     def lost(cls, sensor: SensorFrame) -> Obstacles:

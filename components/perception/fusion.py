@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from ...dag import In, Out, Processor, Trigger
@@ -87,22 +86,8 @@ class FusionProcessor(Processor):
         unused = sum(self._fusion.incidents.values()) - before
         if unused:
             self.losses.count(self.place, "stale", trigger.version, unused)
-        boxes = fused.boxes.astype(np.float32)
-        # A cluster is as large as what is seen of it now: its track gives it an id, and its own box stays.
-        seen = fused.background & (fused.lidar >= 0)
-        boxes[seen] = detections.boxes[fused.lidar[seen]]
-        self.obstacles.value = Obstacles(
-            version=sensor.version,
-            frame=sensor.index,
-            frame_id=sensor.frame_id,
-            velocity_reference="ego" if sensor.pose is None else "world",
-            ids=fused.ids,
-            classes=fused.classes,
-            scores=fused.existence.astype(np.float32),
-            boxes=boxes,
-            velocities=fused.velocities.astype(np.float32),
-            background=fused.background,
-            missing_inputs=(*detected.missing_inputs, *fused.missing),
+        self.obstacles.value = Obstacles.of_frame(
+            detected, fused, rows=fused.lidar, scores=fused.existence, missing=fused.missing
         )
         return Status.OK
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ...dag import In, Out, Processor, Trigger
 from ...datamesh import Status
 from ...models.tracker import Tracker
@@ -42,21 +40,5 @@ class TrackingProcessor(Processor):
             velocities=detections.velocities,
             pose=sensor.pose,
         )
-        boxes = tracks.boxes.astype(np.float32)
-        # A cluster is as large as what is seen of it now: its track gives it an id, and its own box stays.
-        seen = tracks.background & (tracks.detections >= 0)
-        boxes[seen] = detections.boxes[tracks.detections[seen]]
-        self.obstacles.value = Obstacles(
-            version=sensor.version,
-            frame=sensor.index,
-            frame_id=sensor.frame_id,
-            velocity_reference="ego" if sensor.pose is None else "world",
-            ids=tracks.ids,
-            classes=tracks.classes,
-            scores=tracks.scores.astype(np.float32),
-            boxes=boxes,
-            velocities=tracks.velocities.astype(np.float32),
-            background=tracks.background,
-            missing_inputs=detected.missing_inputs,
-        )
+        self.obstacles.value = Obstacles.of_frame(detected, tracks, rows=tracks.detections, scores=tracks.scores)
         return Status.OK
