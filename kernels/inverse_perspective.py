@@ -17,8 +17,9 @@ import warp as wp
 from .camera import Camera, borrow_image, camera_model, image_point, is_in_image
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, family_of, give
+from .inverse_perspective_parts import Bytes, Weights, sample_parts
 from .plan import plan_for
-from .threads import launch_parts, thread_count
+from .threads import PackedLaunch, thread_count
 
 __all__ = ["GroundImage", "InversePerspective", "inverse_perspective"]
 
@@ -27,9 +28,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _FLAT = (0.0, 0.0, 1.0, 0.0)
 _UNSEEN = wp.constant(-1)
-_WHOLE = wp.constant(8192)  # what the weights of four pixels add up to: with a byte it takes 21 bits
-_Bytes = wp.types.vector(length=3, dtype=wp.uint8)
-_Weights = wp.types.vector(length=4, dtype=wp.uint16)
+_WHOLE = wp.constant(8192)  # what the weights of four pixels add up to, as in inverse_perspective_parts.py
 _LEAST_OF_PART = 16_384  # cells for which a thread of their own is worth its while
 
 
@@ -51,7 +50,7 @@ def _find_pixels(
     # out
     place_out: wp.array(dtype=wp.int32),
     share_out: wp.array(dtype=wp.vec2),
-    weights_out: wp.array(dtype=_Weights),
+    weights_out: wp.array(dtype=Weights),
     seen_out: wp.array(dtype=wp.bool),
 ):
     """Per cell the upper left of the four pixels about its centre, and how far it is towards the lower right.
@@ -82,7 +81,7 @@ def _find_pixels(
         below = int(float(whole) * b + 0.5)
         above_right = int(float(whole - below) * a + 0.5)
         below_right = int(float(below) * a + 0.5)
-        weights_out[cell] = _Weights(
+        weights_out[cell] = Weights(
             wp.uint16(whole - below - above_right),
             wp.uint16(above_right),
             wp.uint16(below - below_right),
@@ -96,13 +95,13 @@ def _find_pixels(
 @wp.kernel
 def _sample_three_bytes(
     # in
-    image_in: wp.array(dtype=_Bytes),
+    image_in: wp.array(dtype=Bytes),
     place_in: wp.array(dtype=wp.int32),
-    weights_in: wp.array(dtype=_Weights),
+    weights_in: wp.array(dtype=Weights),
     right: int,
     down: int,
     # out
-    ground_out: wp.array(dtype=_Bytes),
+    ground_out: wp.array(dtype=Bytes),
 ):
     """One cell a thread, for the images that most cameras give."""
     cell = wp.tid()
@@ -112,80 +111,12 @@ def _sample_three_bytes(
     q = image_in[place + right]
     r = image_in[place + down]
     s = image_in[place + down + right]
-    value = _Bytes()
+    value = Bytes()
     for channel in range(3):
         total = int(p[channel]) * int(weights[0]) + int(q[channel]) * int(weights[1])
         total += int(r[channel]) * int(weights[2]) + int(s[channel]) * int(weights[3])
         value[channel] = wp.uint8((total + _WHOLE / 2) / _WHOLE)
     ground_out[cell] = value
-
-
-# The same in C++, for a CPU: the three bytes of a pixel, 21 bits apart in one number, are weighed at once, and a
-# compiler makes vector instructions of the loop. Eight bytes hold two neighbouring pixels; before the image's end they
-# are read from a little further ahead.
-@wp.func_native("""
-    using Wide = unsigned long long;
-    const unsigned char* const image = (const unsigned char*)image_in.data;
-    const long long bytes = 3LL * image_in.shape[0];
-    const int* const places = place_in.data;
-    const unsigned short* const weights = (const unsigned short*)weights_in.data;
-    unsigned char* const ground = (unsigned char*)ground_out.data;
-    constexpr int BLOCK = 256;
-    const auto apart = [](const Wide pixel) {
-        return (pixel & 0xff) | (pixel & 0xff00) << 13 | (pixel & 0xff0000) << 26;
-    };
-    const auto pixels_at = [&](const long long at) {
-        const long long held = at < bytes - 8 ? at : bytes - 8;
-        Wide pair;
-        memcpy(&pair, image + held, 8);
-        return pair >> 8 * (at - held);
-    };
-    for (int start = first; start < last; start += BLOCK) {
-        const int length = last - start < BLOCK ? last - start : BLOCK;
-        unsigned int colour[BLOCK];
-        for (int k = 0; k < length; ++k) {
-            const unsigned short* const weight = weights + 4 * (start + k);
-            const long long at = 3LL * places[start + k];
-            const Wide above = pixels_at(at), below = pixels_at(at + 3LL * down);
-            const Wide total = apart(above) * weight[0] + apart(above >> 24) * weight[1] + apart(below) * weight[2]
-                + apart(below >> 24) * weight[3] + (4096ULL | 4096ULL << 21 | 4096ULL << 42);
-            colour[k] = (unsigned int)((total >> 13 & 0xff) | (total >> 26 & 0xff00) | (total >> 39 & 0xff0000));
-        }
-        unsigned char* to = ground + 3LL * start;
-        for (int k = 0; k + 1 < length; ++k, to += 3) memcpy(to, colour + k, 4);
-        memcpy(to, colour + length - 1, 3);
-    }
-    return last;
-""")
-def _sample_run(
-    image_in: wp.array(dtype=_Bytes),
-    place_in: wp.array(dtype=wp.int32),
-    weights_in: wp.array(dtype=_Weights),
-    down: int,
-    first: int,
-    last: int,
-    ground_out: wp.array(dtype=_Bytes),
-) -> int:
-    """Draws the cells first … last − 1."""
-
-
-@wp.kernel
-def _sample_three_bytes_in_parts(
-    part: int,
-    parts: int,
-    # in
-    image_in: wp.array(dtype=_Bytes),
-    place_in: wp.array(dtype=wp.int32),
-    weights_in: wp.array(dtype=_Weights),
-    down: int,
-    # out
-    ground_out: wp.array(dtype=_Bytes),
-):
-    """A share of the cells."""
-    cells = place_in.shape[0]
-    share = (cells + parts - 1) / parts
-    first = part * share
-    _sample_run(image_in, place_in, weights_in, down, first, wp.min(first + share, cells), ground_out)
 
 
 @wp.kernel
@@ -273,6 +204,7 @@ class InversePerspective:
         ground.along_row = wp.vec3(steps[0], 0.0, -a * steps[0] / c)
         ground.along_column = wp.vec3(0.0, steps[1], -b * steps[1] / c)
         cells = self.shape[0] * self.shape[1]
+        width, height = self.image_size
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
@@ -280,10 +212,15 @@ class InversePerspective:
         keep("_ground", ground)
         keep("_drawn_for", None)
         three_bytes = self.channels == 3 and self.dtype == wp.uint8
-        keep("_parts", thread_count())
         keep("_place", wp.full(cells, 0 if three_bytes else _UNSEEN, dtype=wp.int32, device=device))
         keep("_share", None if three_bytes else wp.zeros(cells, dtype=wp.vec2, device=device))
-        keep("_weights", wp.zeros(cells, dtype=_Weights, device=device) if three_bytes else None)
+        keep("_weights", wp.zeros(cells, dtype=Weights, device=device) if three_bytes else None)
+        packed = None
+        if three_bytes and width * height >= 3 and _in_parts(device):
+            parts = max(1, min(thread_count(), cells // _LEAST_OF_PART))
+            down = width * min(height - 1, 1)
+            packed = PackedLaunch(sample_parts, parts, [None, self._place, self._weights, down], [None])
+        keep("_packed", packed)
         keep("ground", wp.zeros((*self.shape, self.channels), dtype=self.dtype, device=device))
         keep("seen", wp.zeros(self.shape, dtype=wp.bool, device=device))
 
@@ -322,12 +259,11 @@ class InversePerspective:
         cells = self._place.shape[0]
         if self._weights is not None:
             flat, drawn = _as_pixels(image), _as_pixels(ground)
-            inputs = [flat, self._place, self._weights]
-            if _in_parts(self.device) and flat.shape[0] * 3 >= 8:
-                parts = max(1, min(self._parts, cells // _LEAST_OF_PART))
-                launch_parts(_sample_three_bytes_in_parts, parts, [*inputs, steps[1]], [drawn])
+            if self._packed is not None:
+                self._packed.launch(image_in=flat, ground_out=drawn)
             else:
-                wp.launch(_sample_three_bytes, cells, inputs=[*inputs, *steps], outputs=[drawn], device=self.device)
+                inputs = [flat, self._place, self._weights, *steps]
+                wp.launch(_sample_three_bytes, cells, inputs=inputs, outputs=[drawn], device=self.device)
         else:
             flat, drawn = (array.reshape((-1, self.channels)) for array in (image, ground))
             rounding = 0.5 if self.dtype == wp.uint8 else 0.0
@@ -342,7 +278,7 @@ def _in_parts(device: str) -> bool:
 
 def _as_pixels(image: wp.array) -> wp.array:
     """A view of an image of three bytes a pixel as an array of pixels."""
-    return wp.array(ptr=image.ptr, dtype=_Bytes, shape=image.shape[0] * image.shape[1], device=image.device)
+    return wp.array(ptr=image.ptr, dtype=Bytes, shape=image.shape[0] * image.shape[1], device=image.device)
 
 
 @dataclass(frozen=True, eq=False)
