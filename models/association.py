@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 __all__ = ["assign"]
 
@@ -21,6 +20,9 @@ def assign(cost: np.ndarray) -> np.ndarray:
     Returns:
         The column for each row, −1 where a row stays alone; shape (n,), int64. Of equal solutions always the same.
     """
+    # Here, as it takes a third of a second: who only checks a configuration does without.
+    from scipy.optimize import linear_sum_assignment
+
     columns = np.full(cost.shape[0], _NOT)
     if cost.size:
         clipped = np.minimum(cost, 1.0)

@@ -9,11 +9,11 @@ vehicle moves; else in the sensor's, and then velocities are relative to it.
 
 from __future__ import annotations
 
+import importlib
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..kernels.track_step import TrackStep
 from ..kernels.track_table import COUNTS, PARAMETERS
@@ -91,6 +91,8 @@ class Tracker:
             config: How objects move and are associated, class by class.
             device: The Warp device that the tracks live on.
         """
+        # Half a second: here and not at the first frame, nor where a configuration is only checked.
+        importlib.import_module("scipy.spatial.transform")
         self.config = config or TrackerConfig()
         self.device = device
         self.dropped: Counter[str] = Counter()
@@ -357,11 +359,15 @@ def _room(needed: int, now: int) -> int:
 
 def _motion_of(step: np.ndarray) -> np.ndarray:
     """A small rigid motion as translation and rotation vector, shape (6,)."""
+    from scipy.spatial.transform import Rotation
+
     return np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()])
 
 
 def _motion_to(motion: np.ndarray) -> np.ndarray:
     """The rigid motion of a translation and a rotation vector, shape (4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     step = np.eye(4)
     step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
     step[:3, 3] = motion[:3]
