@@ -232,9 +232,15 @@ class DataProcessComponent(Component):
             self._advance()
 
     def _advance(self) -> None:
-        """Goes on with what waits, in the calling thread, where that is how it runs."""
-        if self._inline:
-            self._serve_inline()
+        """Serves what waits in the calling thread, where that is how it runs and no other thread serves it already."""
+        backlog = self.backlog
+        assert backlog is not None
+        while self._inline and backlog.waiting and self._serving.acquire(blocking=False):
+            try:
+                while (trigger := backlog.take_now()) is not None:
+                    self._run(trigger)
+            finally:
+                self._serving.release()
 
     def _is_busy(self) -> bool:
         return self._running is not None or bool(self.backlog and self.backlog.waiting)
@@ -282,7 +288,7 @@ class DataProcessComponent(Component):
         if self._inline:
             if self._serving.acquire(timeout=self.stop_timeout_s):
                 self._serving.release()
-            self._serve_inline()
+            self._advance()
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join(self.stop_timeout_s)
@@ -307,16 +313,6 @@ class DataProcessComponent(Component):
         assert self.backlog is not None
         while (trigger := self.backlog.take()) is not None:
             self._run(trigger)
-
-    def _serve_inline(self) -> None:
-        """Serves what waits, unless another thread does that already, which then serves it too."""
-        assert self.backlog is not None
-        while self.backlog.waiting and self._serving.acquire(blocking=False):
-            try:
-                while (trigger := self.backlog.take_now()) is not None:
-                    self._run(trigger)
-            finally:
-                self._serving.release()
 
     def _run(self, trigger: Trigger) -> None:
         if trigger.settled:

@@ -23,22 +23,22 @@ _new_trigger = partial(tuple.__new__, Trigger)  # in half the time that the name
 class _Seen:
     """The versions that a source was told of last."""
 
-    __slots__ = ("_newest", "_orders")
+    __slots__ = ("newest", "orders")
 
     def __init__(self) -> None:
-        self._newest = (-1, -1)
-        self._orders: deque[_Order] = deque(maxlen=_REMEMBERED)
+        self.newest = (-1, -1)
+        self.orders: deque[_Order] = deque(maxlen=_REMEMBERED)
 
     def __contains__(self, order: _Order) -> bool:
-        return order <= self._newest and order in self._orders
+        return order <= self.newest and order in self.orders
 
     def add(self, order: _Order) -> bool:
         """Adds one, and tells whether it is new."""
-        if order > self._newest:
-            self._newest = order
-        elif order in self._orders:
+        if order > self.newest:
+            self.newest = order
+        elif order in self.orders:
             return False
-        self._orders.append(order)
+        self.orders.append(order)
         return True
 
 
@@ -79,19 +79,23 @@ class AnyTrigger(TriggerSource):
             window.subscribe(partial(self._on_commit, name), partial(self._on_settle, name), after)
 
     def _on_commit(self, name: str, entry: Entry) -> None:
-        version, epoch = entry.version, entry.epoch
-        if not entry.triggers:
+        version, _, received_ns, committed_ns, epoch, triggers, _, _ = entry
+        if not triggers:
             self._on_settle(name, version, epoch)
             return
+        order, seen, passed = (epoch, version), self._seen, ()
         with self._lock:
-            new = self._seen.add((epoch, version))
-            passed = ()
+            if order > seen.newest:  # the usual case, without a call
+                seen.newest = order
+                seen.orders.append(order)
+                new = True
+            else:
+                new = seen.add(order)
             if self._empty:
                 self._empty.pop((epoch, version), None)
                 passed = self._passed()
         if new:
-            inputs = {name: version}
-            self.offer(_new_trigger((version, entry.received_ns, False, epoch, entry.committed_ns, inputs)))
+            self.offer(_new_trigger((version, received_ns, False, epoch, committed_ns, {name: version})))
         if passed:
             self._settle(passed)
 

@@ -183,16 +183,28 @@ class Window(Generic[T]):
         lost: tuple[tuple[str, int], ...] = ()
         status, oldest = _OK, None
         with self._lock:
-            state = self._state
-            versions = state.versions
-            if entry.epoch == state.epoch and triggers is None and (not versions or entry.version > versions[-1]):
-                index = len(versions)  # the usual case
+            epoch, versions, entries, evicted, settled, gone, previous = state = self._state
+            version = entry[0]
+            if (
+                (not versions or version > versions[-1])
+                and entry[4] == epoch
+                and triggers is None
+                and version not in settled
+                and not self.check
+            ):  # the usual case, without a call
+                freeze(entry[1])
+                if len(versions) >= self.capacity:
+                    evicted, previous = versions[0], None
+                    gone.append(evicted)
+                    versions, entries = versions[1:], entries[1:]
+                versions, entries = versions + (version,), entries + (entry,)  # noqa: RUF005  in half the time
+                self._state = _new_state((epoch, versions, entries, evicted, settled, gone, previous))
             else:
                 status, state, index, entry, lost = self._place(state, policy, entry, equal, triggers)
-            if status is _OK:
-                if self.check and len(state.entries) == self.capacity:
-                    oldest = state.entries[0]
-                entry = self._insert(state, index, entry)
+                if status is _OK:
+                    if self.check and len(state.entries) == self.capacity:
+                        oldest = state.entries[0]
+                    entry = self._insert(state, index, entry)
         # Who watches losses may read the window, or write to it: no lock of it is held.
         if oldest is not None:
             self.verify(oldest)
@@ -255,11 +267,8 @@ class Window(Generic[T]):
             evicted = state.versions[0]
             state.gone.append(evicted)
             previous = None
-        if index == len(state.versions):  # the usual case, in half the time
-            versions, entries = state.versions[first:] + (version,), state.entries[first:] + (entry,)  # noqa: RUF005
-        else:
-            versions = (*state.versions[first:index], version, *state.versions[index:])
-            entries = (*state.entries[first:index], entry, *state.entries[index:])
+        versions = (*state.versions[first:index], version, *state.versions[index:])
+        entries = (*state.entries[first:index], entry, *state.entries[index:])
         settled = state.settled
         if settled and version in settled:
             settled = {other: None for other in settled if other != version}
