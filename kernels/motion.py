@@ -16,23 +16,15 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow, borrow_points, count_on, family_of, give
+from .motion_parts import Segment, move_part
+from .parts import parts_for, run_parts
 from .plan import capacity_for, plan_for
 
 __all__ = ["MotionCompensation", "compensate_motion"]
 
 wp.set_module_options({"fuse_fp": False})
 
-
-@wp.struct
-class _Segment:
-    """From one pose to the next, in the sensor's frame at the reference time."""
-
-    rotation: wp.mat33
-    position: wp.vec3
-    step: wp.vec3
-    axis: wp.vec3
-    half_angle: float
-    per_second: float
+_LEAST_POINTS = 8192  # of a part on a CPU: less is done before another thread has begun
 
 
 @wp.func
@@ -47,9 +39,10 @@ def _move_points(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     t_in: wp.array(dtype=Any),
+    row_in: wp.array(dtype=wp.int32),
     count_in: wp.array(dtype=wp.int32),
     times_in: wp.array(dtype=wp.float64),
-    segments_in: wp.array(dtype=_Segment),
+    segments_in: wp.array(dtype=Segment),
     pose_count_in: wp.array(dtype=wp.int32),
     # in out: zero
     outside: wp.array(dtype=wp.int32),
@@ -61,7 +54,13 @@ def _move_points(
     if i >= count_in[0]:
         return
     last = pose_count_in[0] - 1
-    t = wp.float64(t_in[i])
+    if last < 1:
+        xyz_out[i] = xyz_in[i]
+        return
+    row = i
+    if row_in:
+        row = row_in[i]
+    t = wp.float64(t_in[row])
     # Written so that NaN is outside, and of the first pose.
     if not (t >= times_in[0] and t <= times_in[last]):
         wp.atomic_add(outside, 0, 1)
@@ -112,19 +111,22 @@ class MotionCompensation:
         if self.max_poses < 2:
             raise ValueError(f"max_poses must be at least 2, not {self.max_poses}")
         device = resolve_device(self.device)
+        object.__setattr__(self, "device", device)
 
         def keep(name: str, shape: int, dtype: Any) -> None:
             object.__setattr__(self, name, wp.zeros(shape, dtype=dtype, device=device))
 
         keep("_times", self.max_poses, wp.float64)
-        keep("_segments", self.max_poses - 1, _Segment)
+        keep("_segments", self.max_poses - 1, Segment)
         keep("_pose_count", 1, wp.int32)
         keep("xyz", self.capacity, wp.vec3)
         keep("outside", 1, wp.int32)
-        self.set_poses(np.stack([np.eye(4)] * 2), [0.0, 1.0], 0.0)
+        if device == DEFAULT_DEVICE:  # the host writes into them as they are
+            for name in ("_times", "_segments", "_pose_count"):
+                object.__setattr__(self, f"{name}_on_host", getattr(self, name).numpy())
 
     def set_poses(self, poses: np.ndarray, times: Sequence[float], reference_time: float) -> None:
-        """Takes the motion that later launches undo; a copy to the device, not for a captured graph.
+        """Takes the motion that later launches undo, captured ones too; it copies to the device, outside of a capture.
 
         Args:
             poses: Sensor to world, shape (m, 4, 4), 2 ≤ m ≤ max_poses: rotations and positions [m].
@@ -138,35 +140,51 @@ class MotionCompensation:
         segments = _segments_of(_checked_poses(poses), stamps, float(reference_time))
         if len(stamps) > self.max_poses:
             raise ValueError(f"poses are {len(stamps)}, more than the plan's max_poses of {self.max_poses}")
-        self._times[: len(stamps)].assign(stamps)
-        self._segments[: len(segments)].assign(segments)
-        self._pose_count.assign(np.array([len(stamps)], np.int32))
+        self._put("_times", stamps)
+        self._put("_segments", segments)
+        self._put("_pose_count", np.array([len(stamps)], np.int32))
 
-    def launch(self, xyz: wp.array, t: wp.array, count: wp.array) -> None:
+    def stand_still(self) -> None:
+        """Lets later launches leave the points where they are, as those of a new plan do."""
+        self._put("_pose_count", np.zeros(1, np.int32))
+
+    def _put(self, name: str, values: np.ndarray) -> None:
+        if self.device == DEFAULT_DEVICE:
+            getattr(self, f"{name}_on_host")[: len(values)] = values
+        else:
+            getattr(self, name)[: len(values)].assign(values)
+
+    def launch(
+        self,
+        xyz: wp.array,
+        t: wp.array,
+        count: wp.array,
+        *,
+        rows: wp.array | None = None,
+        moved: wp.array | None = None,
+    ) -> None:
         """Fills `xyz` and `outside` from the first `count[0]` points.
 
         Args:
             xyz: Positions in the sensor's frame, each at its own time [m], shape (n,), vec3, n ≤ capacity.
             t: Time of each point [s], shape (n or more,), float32 or float64.
             count: Shape (1,), int32.
+            rows: Where in `t` each point's time is, shape (n or more,), int32; None: at the point's own place.
+            moved: Where the points go, shape (n or more,), vec3, which may be where they come from; None: `xyz`.
         """
-        if xyz.shape[0] > self.capacity:
-            raise ValueError(f"xyz has {xyz.shape[0]} rows, more than the plan's capacity of {self.capacity}")
-        self._move_into(self.xyz, xyz, t, count)
-
-    def _move_into(self, moved: wp.array, xyz: wp.array, t: wp.array, count: wp.array) -> None:
-        """Writes the points where the caller wants them."""
         n = xyz.shape[0]
-        if t.shape[0] < n or t.dtype not in (wp.float32, wp.float64):
+        if moved is None:
+            if n > self.capacity:
+                raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
+            moved = self.xyz
+        if t.dtype not in (wp.float32, wp.float64) or (rows is None and t.shape[0] < n):
             raise ValueError(f"t must be float32 or float64 with at least {n} rows, as there are points")
         self.outside.zero_()
-        wp.launch(
-            _move_points,
-            n,
-            inputs=[xyz, t, count, self._times, self._segments, self._pose_count, self.outside],
-            outputs=[moved],
-            device=self.device,
-        )
+        given = [xyz, t, rows, count, self._times, self._segments, self._pose_count, self.outside]
+        if self.device == DEFAULT_DEVICE:
+            run_parts(move_part, parts_for(n, _LEAST_POINTS), self.device, given, [moved])
+        else:
+            wp.launch(_move_points, n, inputs=given, outputs=[moved], device=self.device)
 
 
 def _checked_poses(poses: Any) -> np.ndarray:
@@ -220,7 +238,7 @@ def _segments_of(poses: np.ndarray, times: np.ndarray, reference_time: float) ->
     share = (reference_time - times[k]) / (times[k + 1] - times[k])
     back = (turns[k] @ _turned(axis[k], 2 * share * half_angle[k])).T
     origin = positions[k] + share * (positions[k + 1] - positions[k])
-    segments = np.zeros(len(poses) - 1, _Segment.numpy_dtype())
+    segments = np.zeros(len(poses) - 1, Segment.numpy_dtype())
     segments["rotation"] = back @ turns[:-1]
     segments["position"] = (positions[:-1] - origin) @ back.T
     segments["step"] = np.diff(positions, axis=0) @ back.T
@@ -272,6 +290,6 @@ def compensate_motion(points: Any, t: Any, poses: np.ndarray, times: Sequence[fl
     moved = wp.array(
         ptr=table.ptr if n else None, dtype=wp.vec3, shape=(n,), strides=(table.strides[0],), device=table.device
     )
-    plan._move_into(moved, borrowed.xyz, stamps, count_on(n, borrowed.device))
+    plan.launch(borrowed.xyz, stamps, count_on(n, borrowed.device), moved=moved)
     del owner
     return adopt(host, borrowed.family) if host is not None else give(table, borrowed.family)

@@ -194,3 +194,32 @@ def test_more_poses_than_the_plan_takes_are_refused():
     poses, times = drive(3, 16)
     with pytest.raises(ValueError, match="max_poses"):
         MotionCompensation(capacity=16).set_poses(poses, times, times[0])
+
+
+def test_parts_give_the_bytes_of_the_kernel_for_gpus(monkeypatch):
+    """Points in the order of time and in none, of few poses and of many, each at a row of its own among the times."""
+    from warploom.kernels import motion
+
+    rng = np.random.default_rng(17)
+    for m, n in ((2, 1), (3, 5000), (12, 700), (40, 3000)):
+        poses, times = drive(m, 18 + m)
+        points, t = cloud(n, times, 19, reach=0.01)
+        rows = rng.permutation(n)
+        t = t.astype(np.float32) if m % 2 else t
+        xyz, stamps = wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu"), wp.array(t, device="cpu")
+        index, count = wp.array(rows.astype(np.int32), device="cpu"), wp.array([n], dtype=wp.int32, device="cpu")
+        plan = MotionCompensation(capacity=n, max_poses=m)
+        plan.set_poses(poses, times, times[1])
+        expected, outside = wp.zeros(n, dtype=wp.vec3, device="cpu"), wp.zeros(1, dtype=wp.int32, device="cpu")
+        given = [xyz, stamps, index, count, plan._times, plan._segments, plan._pose_count, outside]
+        wp.launch(motion._move_points, n, inputs=given, outputs=[expected], device="cpu")
+        for parts in (1, 2, 3, 7):
+            monkeypatch.setattr(motion, "parts_for", lambda n, least, parts=parts: parts)
+            plan.launch(xyz, stamps, count, rows=index)
+            assert plan.xyz.numpy().tobytes() == expected.numpy().tobytes()
+            assert plan.outside.numpy()[0] == outside.numpy()[0] > (0 if n > 100 else -1)
+        plan.launch(xyz, stamps, count, rows=index, moved=xyz)  # in place
+        assert xyz.numpy().tobytes() == expected.numpy().tobytes()
+        plan.stand_still()
+        plan.launch(xyz, stamps, count, rows=index)
+        assert plan.xyz.numpy().tobytes() == expected.numpy().tobytes()
