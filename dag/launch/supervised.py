@@ -75,6 +75,8 @@ class _Life:
     output: asyncio.ReadTransport
     mail: asyncio.Queue[tuple[str, Any]]
     heard: float
+    patience_s: float
+    """How long it may take to stop."""
     error: str = ""
     """What it said of its end."""
     hung: str = ""
@@ -137,6 +139,7 @@ class SupervisedProcess:
         self._ran = False
         self._asked_to_stop = False
         self._stop_wish = asyncio.Event()
+        self._hurry_s: float | None = None
         self._numbers = 0
         self.changed = asyncio.Condition()
 
@@ -248,7 +251,7 @@ class SupervisedProcess:
                     self._signal(life, signal.SIGKILL)
                     due = None
                 elif self.state is State.STOPPING:
-                    life.hung = f"did not stop within {self.spec.stop_timeout_s:g} s"
+                    life.hung = f"did not stop within {life.patience_s:g} s"
                     self._kill_hanging(life)
                     killing, due = True, now + 0.2
                 elif self.state is State.RUNNING and (silent := now - life.heard) < (self.spec.health_timeout_s or 0):
@@ -259,12 +262,15 @@ class SupervisedProcess:
                     life.hung = f"{what} for {limit:g} s"
                     self._kill_hanging(life)
                     killing, due = True, now + _TERM_GRACE_S
-            elif kind == "stop" and not killing:
+            elif kind == "stop" and not killing and self.state is not State.STOPPING:
                 building = self.state is State.BUILDING
                 await self._enter(State.STOPPING)
                 due = now + self.spec.stop_timeout_s
                 if not self._send(life, {"do": "stop"}) or building:
                     self._signal(life, signal.SIGTERM)
+            elif kind == "hurry" and not killing:
+                due = now + what if due is None else min(due, now + what)
+                life.patience_s = min(life.patience_s, what)
             elif kind == "kill":
                 killing, due = True, now
             elif kind == "start":
@@ -332,6 +338,13 @@ class SupervisedProcess:
         self._stop_wish.set()
         if self._life is not None:
             self._life.mail.put_nowait(("stop", None))
+
+    def hurry(self, seconds: float) -> None:
+        """Lets it end, and kills it if it has not by then; it may have been asked to stop already."""
+        self.ask_to_stop()
+        self._hurry_s = seconds
+        if self._life is not None:
+            self._life.mail.put_nowait(("hurry", seconds))
 
     def kill(self) -> None:
         """Ends it at once."""
@@ -403,7 +416,9 @@ class SupervisedProcess:
         now = time.monotonic()
         if self._asked_to_stop:
             mail.put_nowait(("stop", None))
-        life = _Life(process, pidfd, now, writer, [], output, mail, now)
+        if self._hurry_s is not None:
+            mail.put_nowait(("hurry", self._hurry_s))
+        life = _Life(process, pidfd, now, writer, [], output, mail, now, self.spec.stop_timeout_s)
         life.tasks.append(asyncio.create_task(self._read_reports(reader, life)))
         return life
 

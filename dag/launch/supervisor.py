@@ -23,12 +23,16 @@ from .order import consumers_first
 from .plan import LaunchPlan
 from .run_folder import RotatedLog, RunFolder
 from .schema import ProcessSpec
+from .signals import SignalInbox
 from .supervised import FINAL, State, SupervisedProcess
 
 if TYPE_CHECKING:
     from .linking import LinkPlan
 
-__all__ = ["Supervisor"]
+__all__ = ["HURRY_S", "Supervisor"]
+
+HURRY_S = 2.0
+"""How long a process may take to stop after a second signal: enough to close what it records [s]."""
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +79,7 @@ class Supervisor:
         self._ending: asyncio.Event = asyncio.Event()
         self._exit_code = 0
         self._reason = ""
-        self._interrupts = 0
+        self._haste = 0
         self._control: ControlServer | None = None
         self._started = time.monotonic()
 
@@ -92,9 +96,12 @@ class Supervisor:
             raise ConfigError("the launcher runs on Linux alone: it watches processes by pidfd")
         self.folder.open()
         try:
-            return asyncio.run(self._run())
+            with SignalInbox((signal.SIGINT, signal.SIGTERM, signal.SIGHUP)) as signals:
+                try:
+                    return asyncio.run(self._run(signals))
+                finally:
+                    self._groups.close()
         finally:
-            self._groups.close()
             self.folder.close()
 
     def _tell(self, event: Event) -> None:
@@ -103,12 +110,8 @@ class Supervisor:
         if self._control is not None:
             self._control.tell(event)
 
-    async def _run(self) -> int:
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is signal.SIG_IGN:
-                continue  # as nohup has it, and a shell for what runs in the background
-            loop.add_signal_handler(number, self._interrupted, number)
+    async def _run(self, signals: SignalInbox) -> int:
+        signals.deliver(asyncio.get_running_loop(), self._interrupted)
         self._control = ControlServer(self.folder.control, self._answers())
         await self._control.open()
         try:
@@ -217,12 +220,15 @@ class Supervisor:
             self._ending.set()
 
     def _interrupted(self, number: int) -> None:
-        self._interrupts += 1
-        if self._interrupts == 1:
-            self._end(0, f"{signal.Signals(number).name}")
-        else:
+        """The first signal stops the node in order; the second lets all stop at once, and soon; the third kills."""
+        if not self._ending.is_set():
+            self._end(0, signal.Signals(number).name)
+        elif number != signal.SIGHUP:  # a terminal that is closed may send several
+            self._haste += 1
+            seconds = HURRY_S if self._haste == 1 else 0.0
+            self._tell({"event": "hurried", "reason": signal.Signals(number).name, "seconds": seconds})
             for process in self.processes.values():
-                process.kill()
+                process.hurry(seconds) if seconds else process.kill()
 
     async def _stop(self) -> None:
         """Stops the processes, those that produce first, each after it has ended."""

@@ -162,7 +162,27 @@ def test_a_node_of_which_nothing_is_left_ends(run):
     assert (one.code, one.find("ended")[0]["reason"]) == (1, "no process is left")
 
 
-def test_a_second_signal_kills_what_does_not_stop(run):
+def test_a_second_signal_leaves_all_at_once_the_time_to_flush(run, tmp_path):
+    def scenario(node):
+        node.wait_for("up")
+        os.kill(os.getpid(), signal.SIGINT)
+        node.wait_for("state", state="stopping")
+        os.kill(os.getpid(), signal.SIGHUP)  # no haste
+
+    marks = {name: tmp_path / name for name in "ab"}
+    # Both are told to stop before the first of them has: in order, b would only be told after a has ended.
+    links = {"a": LinkPlan(exports=("x",)), "b": LinkPlan(imports=("x",))}
+    behaviours = {name: f"flushes for half a second {mark}" for name, mark in marks.items()}
+    one = run(behaviours, links=links).through(scenario)
+    assert one.code == 0
+    assert all(mark.exists() for mark in marks.values())
+    assert [event["code"] for event in one.find("exited")] == [0, 0]
+    assert [(event["reason"], event["seconds"]) for event in one.find("hurried")] == [("SIGTERM", 2.0)]
+    told = [event["event"] if event["event"] == "exited" else event.get("state") for event in one.events]
+    assert told.index("exited") > len(told) - 1 - told[::-1].index("stopping")
+
+
+def test_after_a_second_signal_what_does_not_stop_is_killed(run):
     def scenario(node):
         node.wait_for("up")
         os.kill(os.getpid(), signal.SIGINT)
@@ -170,7 +190,35 @@ def test_a_second_signal_kills_what_does_not_stop(run):
 
     one = run({"a": "does not stop"}, a={"stop_timeout_s": 50.0}).through(scenario)
     assert one.code == 0
+    assert one.find("died")[0]["reason"] == "did not stop within 2 s; was ended by SIGKILL"
+
+
+def test_a_third_signal_kills_at_once(run, monkeypatch):
+    monkeypatch.setattr("warploom.dag.launch.supervisor.HURRY_S", 50.0)
+
+    def scenario(node):
+        node.wait_for("up")
+        os.kill(os.getpid(), signal.SIGINT)
+        node.wait_for("state", state="stopping")
+        os.kill(os.getpid(), signal.SIGINT)
+        node.wait_for("hurried")
+
+    one = run({"a": "does not stop"}, a={"stop_timeout_s": 50.0}).through(scenario)
+    assert one.code == 0
     assert one.find("died")[0]["reason"] == "was ended by SIGKILL"
+    assert [event["seconds"] for event in one.find("hurried")] == [50.0, 0.0]
+
+
+def test_a_signal_after_the_end_does_what_it_did_before(run):
+    came = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: came.append(number))
+    try:
+        run({"a": "ends"}, a={"exception_handler": "exit"}).through()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert came == [signal.SIGTERM]
+        assert signal.set_wakeup_fd(-1) == -1
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_what_dead_processes_left_is_removed_before_and_after_and_between(run):

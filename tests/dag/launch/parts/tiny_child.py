@@ -63,6 +63,9 @@ for order in orders():
         if behaviour == "ends":
             sys.exit(0)
     elif order["do"] == "stop":
+        if behaviour.startswith("flushes for half a second "):
+            time.sleep(0.5)
+            open(behaviour.removeprefix("flushes for half a second "), "w").close()
         if behaviour == "does not stop":
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             time.sleep(60)
