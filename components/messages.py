@@ -60,15 +60,22 @@ class SensorFrame:
     index: int
     """Number of the frame in its source, from 0; frames that could not be read leave a gap."""
     points: np.ndarray
-    """x y z [m] in the frame `frame_id` (x forward, y left, z up), intensity; shape (n, 4), float32."""
+    """x y z [m] in the frame `frame_id` (x forward, y left, z up) as it was at each point's own time, intensity; shape
+    (n, 4), float32."""
     ring: np.ndarray | None = None
     """Laser number from below, shape (n,), uint16; None where unknown."""
     t: np.ndarray | None = None
-    """Time of each point after `version` [s], shape (n,), float32; None where unknown."""
+    """Time of each point after `version` [s], shape (n,), float32; None where unknown, or where a data set has undone
+    the sensor's motion already."""
     frame_id: str = "lidar"
     """The frame of the points."""
     pose: np.ndarray | None = None
-    """World from sensor, shape (4, 4), float64; None where the ego pose is unknown."""
+    """World from sensor at `version`, shape (4, 4), float64; None where the ego pose is unknown."""
+    poses: np.ndarray | None = None
+    """World from sensor at `pose_times`, by which perception undoes the sensor's own motion during the sweep, shape
+    (m, 4, 4), float64; None where unknown."""
+    pose_times: np.ndarray | None = None
+    """When the sensor had these poses, after `version` [s], rising, from before the sweep to after it; shape (m,)."""
     continues: bool = True
     """False where it has nothing to do with the frame before, as in a data set of single scans: tracks begin anew."""
     truth: Truth | None = None
@@ -149,6 +156,8 @@ class PointLabels:
     """Label of the cluster, −1 for none, shape (n,), int32."""
     dropped: Mapping[str, int]
     """Points that were left out, by reason: non_finite, out_of_range, ego, over_capacity."""
+    compensated: bool = False
+    """True where perception saw all points from where the sensor was at the frame's version."""
 
     @classmethod
     def unknown(cls, n: int) -> PointLabels:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,6 +18,7 @@ from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, lo
 from ..datamesh import CommitPolicy, DataMesh, Entry, Output
 from ..errors import ConfigError, SourceError
 from .messages import Obstacles, PointLabels, SensorFrame
+from .motion import sweep_motion
 from .profile import CONF, Profile, execution_context, load_profile, profile_device, use_threads
 
 __all__ = ["LIDAR_TOPIC", "OBSTACLES_TOPIC", "POINTS_TOPIC", "Latency", "PerceptionFrame", "Pipeline", "StageLatency"]
@@ -71,6 +73,8 @@ class PerceptionFrame:
     """Points that were left out, by reason."""
     data: Mapping[str, Any] = field(default_factory=dict)
     """What was committed at this version to the further topics that `Pipeline.run` was asked for, by topic."""
+    compensated: bool = False
+    """True where perception undid the sensor's own motion during the sweep."""
     failed: bool = False
     """True where no obstacles came out: a processor raised, or the frame was dropped on the way."""
 
@@ -84,10 +88,16 @@ class PerceptionFrame:
         """Number of the frame in its source."""
         return self.sensor.index
 
-    @property
+    @cached_property
     def points(self) -> np.ndarray:
-        """The points of the LiDAR frame, shape (n, 4)."""
-        return self.sensor.points
+        """The points of the LiDAR frame as perception saw them, shape (n, 4).
+
+        That is `sensor.points`, less the sensor's own motion during the sweep where that was undone.
+        """
+        motion = sweep_motion(self.sensor) if self.compensated else None
+        from ..kernels.motion import compensate_motion
+
+        return self.sensor.points if motion is None else compensate_motion(self.sensor.points, *motion, 0.0)
 
 
 class Pipeline:
@@ -425,6 +435,7 @@ class _Run:
             clusters=labels.clusters,
             latency=Latency(total, stages),
             dropped=labels.dropped,
+            compensated=labels.compensated,
             data={topic: parts[topic].value for topic in self._topics if parts[topic] is not None},
             failed=obstacles is None,
         )

@@ -7,11 +7,12 @@ is recorded when the chain is made and replayed for each frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from .bev import BevMaps
@@ -23,6 +24,7 @@ from .device import DEFAULT_DEVICE, resolve_device
 from .filters import PointFilter
 from .ground import GroundSegment
 from .interop import Family, Points, borrow_points, family_of
+from .motion import MotionCompensation
 from .pillar import PillarGrid
 from .selection import select_heights
 from .threads import run_together
@@ -47,6 +49,10 @@ class ChainConfig:
     """Filter: xmin ymin zmin xmax ymax zmax [m] of what stays, upper bounds open; None for everywhere."""
     ego_box: tuple[float, ...] | None = (-2.5, -1.2, -2.5, 2.5, 1.2, 0.5)
     """Filter: the same of the own vehicle, whose points go; None for none."""
+
+    max_poses: int = 0
+    """Motion: poses of a sweep that `upload` may be given, 2 or more, to move its points to where they were seen from
+    at one time; 0 leaves the step out."""
 
     sensor_height: float | None = None
     """Ground: height of the frame's origin above it [m], held to within 0.5 m; None to estimate it in each frame."""
@@ -94,6 +100,8 @@ class ChainConfig:
             raise ValueError(f"stages must be of {', '.join(CHAIN_STAGES)}, not {', '.join(map(repr, unknown))}")
         if "boxes" in self.stages and "cluster" not in self.stages:
             raise ValueError("stages with 'boxes' must have 'cluster', around whose clusters they are")
+        if self.max_poses < 0 or self.max_poses == 1:
+            raise ValueError(f"max_poses must be 0, or 2 or more, not {self.max_poses}")
         if not self.min_height <= self.max_height:
             raise ValueError(
                 f"min_height must be at most max_height, not {self.min_height} with a max_height of {self.max_height}"
@@ -133,6 +141,9 @@ class KernelChain:
     """In: x y z [m] and intensity, shape (capacity, 4), float32."""
     count: wp.array = field(init=False, repr=False, compare=False)
     """In: how many points there are, shape (1,), int32; it may be more than `capacity`."""
+    t: wp.array = field(init=False, repr=False, compare=False)
+    """In, where the chain has motion: time of each point from the one that all shall be seen at [s], shape (capacity,),
+    float32."""
     xyz: wp.array = field(init=False, repr=False, compare=False)
     """Positions of the points that passed the filter [m], in order, shape (capacity,), vec3."""
     intensity: wp.array = field(init=False, repr=False, compare=False)
@@ -170,6 +181,7 @@ class KernelChain:
         config, room = self.config, {"capacity": self.capacity, "device": device}
         has = {stage: stage in config.stages for stage in CHAIN_STAGES}
         select = PointFilter(point_range=config.point_range, ego_box=config.ego_box, **room)
+        motion = config.max_poses and MotionCompensation(capacity=1, max_poses=config.max_poses, device=device)
         ground = GroundSegment(sensor_height=config.sensor_height, **room)
         cluster = has["cluster"] and EuclideanCluster(
             radius=config.radius, radius_per_metre=config.radius_per_metre, min_size=config.min_size, **room
@@ -192,10 +204,19 @@ class KernelChain:
             for name, value in values.items():
                 object.__setattr__(self, name, value)
 
-        keep(_filter=select, _ground=ground, _cluster=cluster, _boxes=boxes, _channels=channels, _bev=maps)
+        keep(
+            _filter=select,
+            _motion=motion,
+            _ground=ground,
+            _cluster=cluster,
+            _boxes=boxes,
+            _channels=channels,
+            _bev=maps,
+        )
         points = wp.zeros((self.capacity, _COLUMNS), dtype=wp.float32, device=device)
         keep(points=points, count=wp.zeros(1, dtype=wp.int32, device=device))
         keep(_input=borrow_points(points))
+        keep(t=wp.zeros(self.capacity if motion else 0, dtype=wp.float32, device=device))
         keep(_standing=wp.zeros(self.capacity, dtype=wp.bool, device=device))
         keep(xyz=select.xyz, intensity=select.intensity, index=select.index, kept=select.count)
         keep(ground=ground.mask, height=ground.height, sensor_height=ground.found_height)
@@ -222,6 +243,7 @@ class KernelChain:
         """What runs when: the waves one after the other, the lanes of a wave side by side."""
         waves = [
             [self._filter_points],
+            [self._motion and self._undo_motion],
             [self._segment_ground, self.pillars and self._fill_pillars],
             [self._cluster and self._cluster_and_fit, (self._channels or self._bev) and self._draw_maps],
             [self._collect_counts],
@@ -230,6 +252,9 @@ class KernelChain:
 
     def _filter_points(self) -> None:
         self._filter.launch(self._input.xyz, self._input.intensity, self.count)
+
+    def _undo_motion(self) -> None:
+        self._motion.launch(self.xyz, self.t, self.kept, rows=self.index, moved=self.xyz)
 
     def _segment_ground(self) -> None:
         self._ground.launch(self.xyz, self.kept)
@@ -304,20 +329,42 @@ class KernelChain:
 
     # ---- in and out
 
-    def upload(self, points: Any) -> None:
-        """Copies a frame into `points` and `count`.
+    def upload(
+        self, points: Any, *, t: Any = None, poses: np.ndarray | None = None, times: Sequence[float] = ()
+    ) -> None:
+        """Copies a frame into `points` and `count`, and what is known of the sensor's motion.
 
         From the host to a GPU through pinned memory; it waits until the copy of the frame before has been made.
 
         Args:
             points: x y z [m] and, as the fourth column where there is one, intensity, shape (n, 3 or more), floating;
                 NumPy, torch, Warp or DLPack, on the host or on the chain's device. Further columns are left out.
+            t: Time of each point [s], shape (n,), on the host; 0 is when all shall be seen from. None: they stay where
+                they are.
+            poses: World from sensor, shape (m, 4, 4), where there is `t`; at most as many as the configuration says.
+            times: When the sensor had them, rising, of the clock of `t`, shape (m,) [s].
 
         Raises:
             TypeError: `points` is not a floating array.
-            ValueError: It has another shape, or lies on a third device.
+            ValueError: It has another shape, or lies on a third device; or times or poses do not fit.
         """
         self._upload(borrow_points(points))
+        if t is not None:
+            self._upload_motion(t, poses, times, len(points))
+        elif self._motion:
+            self._motion.stand_still()
+
+    def _upload_motion(self, t: Any, poses: Any, times: Sequence[float], offered: int) -> None:
+        if not self._motion:
+            raise ValueError("t makes sense in a chain whose configuration has max_poses, not 0")
+        if np.shape(t) != (offered,):
+            raise ValueError(f"t must have shape ({offered},), as there are points, not {np.shape(t)}")
+        self._motion.set_poses(poses, times, 0.0)
+        n = min(offered, self.capacity)
+        if self.device == DEFAULT_DEVICE:
+            self.t.numpy()[:n] = t[:n]
+        elif n:
+            self.t[:n].assign(np.ascontiguousarray(t[:n], np.float32))
 
     def _upload(self, borrowed: Points) -> None:
         offered, columns = borrowed.table.shape
@@ -370,6 +417,6 @@ class KernelChain:
             TypeError: `points` is not a floating array.
             ValueError: It has another shape, or lies on a third device.
         """
-        self._upload(borrow_points(points))
+        self.upload(points)
         self.launch()
         return self.result(family_of(points), copy=copy)

@@ -36,8 +36,8 @@ _MOVE = """
     const int poses = pose_count_in.data[0];
     const long long step_in = xyz_in.strides[0] / 4, step_out = xyz_out.strides[0] / 4;
     const long long step_t = t_in.strides[0] / sizeof(*t_in.data);
-    const float* __restrict from = (const float*)xyz_in.data;
-    float* __restrict to = (float*)xyz_out.data;
+    const float* from = (const float*)xyz_in.data;  // may be where they go
+    float* to = (float*)xyz_out.data;
     if (poses < 2) {
         if (from != to)
             for (long long i = first; i < last; ++i)

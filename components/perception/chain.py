@@ -9,6 +9,7 @@ from ...datamesh import Status
 from ...kernels.chain import ChainConfig, KernelChain
 from ..execution import ExecutionContext
 from ..messages import SensorFrame
+from ..motion import MAX_POSES, sweep_motion
 from .clustering import ClusterConfig, Clusters
 from .filtering import FilterConfig, FilteredCloud
 from .ground import GroundSurface
@@ -55,6 +56,7 @@ class ChainProcessor(Processor):
             stages=("cluster",),
             point_range=config.point_range,
             ego_box=config.ego_box,
+            max_poses=MAX_POSES if config.motion_compensation else 0,
             sensor_height=context.mounting_height,
             radius=config.radius,
             radius_per_metre=config.radius_per_metre,
@@ -69,12 +71,17 @@ class ChainProcessor(Processor):
         """Uploads one frame and runs the chain on it."""
         sensor = self.sensor.value
         chain = next(self._chains)
-        chain.upload(sensor.points)
+        motion = sweep_motion(sensor, self.losses, self.place) if chain.config.max_poses else None
+        if motion is None:
+            chain.upload(sensor.points)
+        else:
+            chain.upload(sensor.points, t=motion.t, poses=motion.poses, times=motion.times)
         chain.launch()
         counts, sensor_height = chain.read_counts()
         n = counts["kept"]
         dropped = {reason: counts[reason] for reason in ("non_finite", "out_of_range", "ego", "over_capacity")}
-        self.filtered.value = FilteredCloud(sensor, chain.xyz[:n], chain.kept, chain.index[:n], dropped)
+        xyz, index = chain.xyz[:n], chain.index[:n]
+        self.filtered.value = FilteredCloud(sensor, xyz, chain.kept, index, dropped, motion is not None)
         self.ground.value = GroundSurface(chain.ground[:n], chain.height[:n], sensor_height)
         assert chain.labels is not None  # the chain has the stage
         self.clusters.value = Clusters(chain.labels[:n], counts["clusters"])

@@ -32,5 +32,7 @@ class PointLabelsProcessor(Processor):
         ground[index] = self.ground.value.mask.numpy()
         height[index] = self.ground.value.height.numpy()
         clusters[index] = self.clusters.value.labels.numpy()
-        self.labels.value = PointLabels(ground=ground, height=height, clusters=clusters, dropped=cloud.dropped)
+        self.labels.value = PointLabels(
+            ground=ground, height=height, clusters=clusters, dropped=cloud.dropped, compensated=cloud.compensated
+        )
         return Status.OK

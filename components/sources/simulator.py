@@ -46,6 +46,7 @@ class SimulatorSource(Source):
         return (self._sensor_frame(frame) for frame in self._simulator)
 
     def _sensor_frame(self, frame: SimulatedFrame) -> SensorFrame:
+        moves = frame.pose_times[0] < frame.pose_times[-1]
         return SensorFrame(
             version=int(frame.version),
             index=int(frame.index),
@@ -54,6 +55,8 @@ class SimulatorSource(Source):
             t=frame.t,
             frame_id=self.frame_id,
             pose=frame.pose,
+            poses=frame.poses if moves else None,
+            pose_times=frame.pose_times if moves else None,
             truth=Truth(
                 boxes=np.asarray(frame.boxes, np.float32),
                 classes=np.asarray(frame.classes, np.int32),
