@@ -38,7 +38,7 @@ class Camera:
 
 
 def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[float] | None = None) -> Camera:
-    """What kernels need of a camera.
+    """What kernels need of a camera; for the same numbers the same object, to be read only.
 
     Args:
         camera_from_points: From the frame of the points to the camera's (x right, y down, z ahead), shape (4, 4).
@@ -49,13 +49,21 @@ def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[
     Raises:
         ValueError: A shape or a number does not fit; the message says which.
     """
-    pose = np.asarray(camera_from_points, np.float64)
+    pose, matrix = (np.ascontiguousarray(array, np.float64) for array in (camera_from_points, intrinsics))
+    numbers = np.zeros(0) if distortion is None else np.asarray(distortion, np.float64).ravel()
+    return _camera(pose.shape, pose.tobytes(), matrix.shape, matrix.tobytes(), numbers.tobytes())
+
+
+@lru_cache(maxsize=64)  # cameras seldom change
+def _camera(pose_shape: tuple, pose_bytes: bytes, matrix_shape: tuple, matrix_bytes: bytes, numbers: bytes) -> Camera:
+    pose = np.frombuffer(pose_bytes).reshape(pose_shape)
+    matrix = np.frombuffer(matrix_bytes).reshape(matrix_shape)
+    distortion = np.frombuffer(numbers)
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise ValueError(f"camera_from_… must be a finite transform of shape (4, 4) with last row 0 0 0 1, not {pose}")
     turn = pose[:3, :3]
     if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise ValueError(f"camera_from_… must be rigid, its upper left 3 × 3 part a rotation, not {turn.tolist()}")
-    matrix = np.asarray(intrinsics, np.float64)
     if matrix.shape not in ((3, 3), (3, 4)) or not np.isfinite(matrix).all():
         raise ValueError(f"intrinsics must be finite, of shape (3, 3) or (3, 4), not {matrix}")
     below = np.abs([*matrix[1:, 0], matrix[2, 1], matrix[2, 2] - 1]).max()
@@ -63,10 +71,9 @@ def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[
         raise ValueError(
             f"intrinsics must be upper triangular with positive focal lengths and last row 0 0 1, not {matrix.tolist()}"
         )
-    numbers = np.zeros(8) if distortion is None else np.asarray(distortion, np.float64).ravel()
-    if len(numbers) not in _COEFFICIENTS or not np.isfinite(numbers).all():
+    if len(distortion) not in _COEFFICIENTS or not np.isfinite(distortion).all():
         raise ValueError(f"distortion must be 4, 5 or 8 finite numbers, k1 k2 p1 p2 [k3 [k4 k5 k6]], not {distortion}")
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(numbers, (0, 8 - len(numbers)))
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(distortion, (0, 8 - len(distortion)))
     moved = np.linalg.solve(matrix[:, :3], matrix[:, 3]) if matrix.shape[1] == 4 else np.zeros(3)
     camera = Camera()
     camera.rotation = wp.mat33(*turn.ravel())
@@ -76,7 +83,7 @@ def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[
     camera.centre = wp.vec2(matrix[0, 2], matrix[1, 2])
     camera.radial, camera.radial_below = wp.vec3(k1, k2, k3), wp.vec3(k4, k5, k6)
     camera.tangential = wp.vec2(p1, p2)
-    camera.is_distorted = int(numbers.any())
+    camera.is_distorted = int(distortion.any())
     camera.widest_squared = _fold((k1, k2, k3), (k4, k5, k6)) ** 2 if camera.is_distorted else np.inf
     return camera
 

@@ -8,16 +8,14 @@ import warp as wp
 
 from .device import resolve_device  # noqa: F401  (starts Warp)
 
-__all__ = ["paint", "paint_in_parts"]
+__all__ = ["PAINT", "paint"]
 
 # What is read between pixels must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_RUN = wp.constant(1024)  # points that one part paints before it leaves as many to others
-
 
 # In C++, as Warp's own indices are checked and strided anew for every channel of four pixels.
-_PAINT = """
+PAINT = """
     const int height = image.shape[0], width = image.shape[1], channels = values.shape[1];
     const long long down = image.strides[0] / sizeof(*image.data), across = image.strides[1] / sizeof(*image.data);
     const long long deep = image.strides[2] / sizeof(*image.data);
@@ -48,7 +46,7 @@ _PAINT = """
 for _dtype in (wp.uint8, wp.float32):
 
     @wp.func_native(
-        _PAINT
+        PAINT
         + """
         float* value = (float*)((char*)values.data + i * (long long)values.strides[0]);
         if (visible) paint_point(pixel, value);
@@ -65,26 +63,6 @@ for _dtype in (wp.uint8, wp.float32):
         values: wp.array2d(dtype=wp.float32),
     ):
         """What the image says at a point's pixel."""
-
-    @wp.func_native(
-        _PAINT
-        + """
-        float* value = values.data + (long long)first * channels;
-        memset(value, 0, (long long)(last - first) * channels * 4);
-        for (int i = first; i < last; ++i, value += channels)
-            if (visible.data[i]) paint_point(pixels.data[i], value);
-        """
-    )
-    def _paint_run(
-        first: int,
-        last: int,
-        pixels: wp.array(dtype=wp.vec2),
-        visible: wp.array(dtype=wp.bool),
-        image: wp.array3d(dtype=_dtype),
-        bilinear: int,
-        values: wp.array2d(dtype=wp.float32),
-    ):
-        """The same for the points first … last − 1 of contiguous arrays."""
 
 
 @wp.kernel
@@ -104,26 +82,5 @@ def paint(
         _paint_point(i, pixels_in[i], visible_in[i], image_in, bilinear, values_out)
 
 
-@wp.kernel
-def paint_in_parts(
-    part: int,
-    parts: int,
-    # in
-    pixels_in: wp.array(dtype=wp.vec2),
-    visible_in: wp.array(dtype=wp.bool),
-    count_in: wp.array(dtype=wp.int32),
-    image_in: wp.array3d(dtype=Any),
-    bilinear: int,
-    points: int,
-    # out
-    values_out: wp.array2d(dtype=wp.float32),
-):
-    """Every so many runs of points, so that those in the image are shared out."""
-    n = wp.min(count_in[0], points)
-    for run in range(part, (n + _RUN - 1) / _RUN, parts):
-        _paint_run(run * _RUN, wp.min((run + 1) * _RUN, n), pixels_in, visible_in, image_in, bilinear, values_out)
-
-
 for _dtype in (wp.uint8, wp.float32):
     wp.overload(paint, {"image_in": wp.array3d(dtype=_dtype)})
-    wp.overload(paint_in_parts, {"image_in": wp.array3d(dtype=_dtype)})

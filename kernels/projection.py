@@ -17,10 +17,11 @@ import warp as wp
 
 from .camera import Camera, borrow_image, camera_model, image_point, is_in_image
 from .device import DEFAULT_DEVICE, resolve_device
-from .image_values import paint, paint_in_parts
+from .image_values import paint
 from .interop import Points, adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
-from .threads import launch_parts, thread_count
+from .projection_parts import paint_in_parts, project_in_parts
+from .threads import PackedLaunch, thread_count
 
 __all__ = ["Painted", "PointPainting", "PointProjection", "Projected", "paint_points", "project_points"]
 
@@ -29,6 +30,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _INFINITE_DEPTH = 0x7F800000  # the bits of infinity
 _METHODS = ("bilinear", "nearest")
+_RESULTS = (wp.vec2, wp.float32, wp.bool)
 _LEAST_OF_PART = 16_384  # points for which a thread of their own is worth its while
 
 
@@ -72,82 +74,6 @@ def _project(
     visible_out[i] = visible
 
 
-# In C++, where a compiler makes vector instructions of the loop; it computes what `image_point` and `is_in_image` do.
-@wp.func_native("""
-    const float* const r = (const float*)&camera.rotation;
-    const float tx = camera.translation[0], ty = camera.translation[1], tz = camera.translation[2];
-    const float fx = camera.focal[0], fy = camera.focal[1], cx = camera.centre[0], cy = camera.centre[1];
-    const float r0 = r[0], r1 = r[1], r2 = r[2], r3 = r[3], r4 = r[4], r5 = r[5], r6 = r[6], r7 = r[7], r8 = r[8];
-    const float skew = camera.skew, right = (float)width - 0.5f, bottom = (float)height - 0.5f;
-    float* const depths = depth.data;
-    float* const to = (float*)pixels.data;
-    unsigned char* const seen = (unsigned char*)visible.data;
-    const auto run = [&](const long long step) {
-        const float* const from = (const float*)xyz.data;
-        for (int i = first; i < last; ++i) {
-            const float px = from[i * step], py = from[i * step + 1], pz = from[i * step + 2];
-            const float z = r6 * px + r7 * py + r8 * pz + tz;
-            const float x = (r0 * px + r1 * py + r2 * pz + tx) / z;
-            const float y = (r3 * px + r4 * py + r5 * pz + ty) / z;
-            const float u = z > 0.0f ? fx * x + skew * y + cx : NAN;
-            const float v = z > 0.0f ? fy * y + cy : NAN;
-            to[2 * i] = u;
-            to[2 * i + 1] = v;
-            depths[i] = z;
-            seen[i] = (u >= -0.5f) & (v >= -0.5f) & (u < right) & (v < bottom);
-        }
-    };
-    if (xyz.strides[0] == 16) run(4);
-    else if (xyz.strides[0] == 12) run(3);
-    else run(xyz.strides[0] / 4);
-    return last;
-""")
-def _project_run(
-    xyz: wp.array(dtype=wp.vec3),
-    camera: Camera,
-    width: int,
-    height: int,
-    first: int,
-    last: int,
-    pixels: wp.array(dtype=wp.vec2),
-    depth: wp.array(dtype=wp.float32),
-    visible: wp.array(dtype=wp.bool),
-) -> int:
-    """Projects the points first … last − 1 onto a camera without distortion."""
-
-
-@wp.kernel
-def _project_in_parts(
-    part: int,
-    parts: int,
-    # in
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    camera: Camera,
-    width: int,
-    height: int,
-    # out
-    pixels_out: wp.array(dtype=wp.vec2),
-    depth_out: wp.array(dtype=wp.float32),
-    visible_out: wp.array(dtype=wp.bool),
-):
-    """Pixel and depth of a share of the points; nothing hides anything."""
-    rows = xyz_in.shape[0]
-    share = (rows + parts - 1) / parts
-    end = wp.min((part + 1) * share, rows)
-    last = wp.min(end, count_in[0])
-    if camera.is_distorted == 0:
-        _project_run(xyz_in, camera, width, height, part * share, last, pixels_out, depth_out, visible_out)
-    else:
-        for i in range(part * share, last):
-            point = image_point(xyz_in[i], camera)
-            pixels_out[i] = wp.vec2(point[0], point[1])
-            depth_out[i] = point[2]
-            visible_out[i] = is_in_image(point, width, height)
-    for i in range(wp.max(part * share, last), end):
-        visible_out[i] = False
-
-
 @wp.kernel
 def _hide(
     # in
@@ -172,10 +98,6 @@ def _hide(
 def _in_parts(device: str) -> bool:
     """Whether few threads do much each, as suits a CPU, or many little."""
     return resolve_device(device) == DEFAULT_DEVICE
-
-
-def _parts_for(points: int) -> int:
-    return max(1, min(thread_count(), points // _LEAST_OF_PART))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +143,10 @@ class PointProjection:
         def keep(name: str, shape: int | tuple[int, int], dtype: type) -> None:
             object.__setattr__(self, name, wp.zeros(shape, dtype=dtype, device=device))
 
+        parts = max(1, min(thread_count(), self.capacity // _LEAST_OF_PART))
+        object.__setattr__(self, "_parts", parts)
+        given = [None, None, None, *self.image_size]
+        object.__setattr__(self, "_packed", PackedLaunch(project_in_parts, parts, given, [None, None, None]))
         keep("_nearest", cells, wp.int32)
         keep("pixels", self.capacity, wp.vec2)
         keep("depth", self.capacity, wp.float32)
@@ -239,14 +165,18 @@ class PointProjection:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
         self._project_into(self.pixels, self.depth, self.visible, xyz, count, camera)
 
+    def _is_in_parts(self) -> bool:
+        return not self.occlusion_cell and _in_parts(self.device)
+
     def _project_into(
         self, pixels: wp.array, depth: wp.array, visible: wp.array, xyz: wp.array, count: wp.array, camera: Camera
     ) -> None:
         """Writes where the caller wants it."""
         cell = self.occlusion_cell
-        if not cell and _in_parts(self.device):
-            inputs = [xyz, count, camera, *self.image_size]
-            launch_parts(_project_in_parts, _parts_for(xyz.shape[0]), inputs, [pixels, depth, visible])
+        if self._is_in_parts():
+            self._packed.launch(
+                xyz_in=xyz, count_in=count, camera=camera, pixels_out=pixels, depth_out=depth, visible_out=visible
+            )
             return
         if cell:
             self._nearest.fill_(_INFINITE_DEPTH)
@@ -287,6 +217,7 @@ class PointPainting:
             raise ValueError(f"method must be 'bilinear' or 'nearest', not {self.method!r}")
         shape = (self.projection.capacity, self.channels)
         object.__setattr__(self, "values", wp.zeros(shape, dtype=wp.float32, device=self.projection.device))
+        object.__setattr__(self, "_packed", {})
 
     def launch(self, xyz: wp.array, count: wp.array, camera: Camera, image: wp.array) -> None:
         """Fills `values` and the outputs of `projection` for the first `count[0]` points.
@@ -297,21 +228,33 @@ class PointPainting:
             camera: From `warploom.kernels.camera.camera_model`.
             image: Shape (height, width, channels), uint8 or float32.
         """
-        self.projection.launch(xyz, count, camera)
-        self._paint_into(self.values, self.projection.pixels, self.projection.visible, xyz.shape[0], count, image)
+        projection, n = self.projection, xyz.shape[0]
+        if n > projection.capacity:
+            raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {projection.capacity}")
+        self._paint_into(self.values, projection.visible, xyz, count, camera, image)
 
     def _paint_into(
-        self, values: wp.array, pixels: wp.array, visible: wp.array, n: int, count: wp.array, image: wp.array
+        self, values: wp.array, visible: wp.array, xyz: wp.array, count: wp.array, camera: Camera, image: wp.array
     ) -> None:
-        wanted = (*self.projection.image_size[::-1], self.channels)
+        """Writes where the caller wants it."""
+        projection = self.projection
+        wanted = (*projection.image_size[::-1], self.channels)
         if tuple(image.shape) != wanted or image.dtype not in (wp.uint8, wp.float32):
             raise ValueError(f"image must be uint8 or float32 of shape {wanted}, not {image.dtype} of {image.shape}")
-        inputs = [pixels, visible, count, image, int(self.method == "bilinear")]
-        device = self.projection.device
-        if _in_parts(device):
-            launch_parts(paint_in_parts, _parts_for(n), [*inputs, n], [values])
-        else:
-            wp.launch(paint, n, inputs=inputs, outputs=[values], device=device)
+        pixels, depth, device = projection.pixels, projection.depth, projection.device
+        is_bilinear = int(self.method == "bilinear")
+        if not projection._is_in_parts():
+            projection._project_into(pixels, depth, visible, xyz, count, camera)
+        if not _in_parts(device):
+            inputs = [pixels, visible, count, image, is_bilinear]
+            wp.launch(paint, xyz.shape[0], inputs=inputs, outputs=[values], device=device)
+            return
+        packed = self._packed.get(image.dtype)
+        if packed is None:
+            is_projected = int(not projection._is_in_parts())
+            given = [None, None, None, *projection.image_size, is_projected, None, is_bilinear, pixels, depth, None]
+            packed = self._packed[image.dtype] = PackedLaunch(paint_in_parts, projection._parts, given, [None])
+        packed.launch(xyz_in=xyz, count_in=count, camera=camera, image_in=image, visible=visible, values_out=values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,27 +279,10 @@ class Painted:
     """Whether a point is in the image and not hidden, shape (n,), bool."""
 
 
-def _projected(borrowed: Points, plan: PointProjection, camera: Camera) -> tuple[Projected, tuple[wp.array, ...]]:
-    """Projects a borrowed cloud, on a CPU straight onto arrays of its own; and the Warp arrays of the result."""
-    n = len(borrowed)
-    count = count_on(n, borrowed.device)
-    if borrowed.device != DEFAULT_DEVICE:
-        plan.launch(borrowed.xyz, count, camera)
-        arrays = (plan.pixels[:n], plan.depth[:n], plan.visible[:n])
-        return Projected(*(give(array, borrowed.family) for array in arrays)), arrays
-    hosts = (np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, bool))
-    arrays = tuple(
-        wp.array(host, dtype=dtype, copy=False, device=DEFAULT_DEVICE)
-        for host, dtype in zip(hosts, (wp.vec2, wp.float32, wp.bool), strict=True)
-    )
-    plan._project_into(*arrays, borrowed.xyz, count, camera)
-    return Projected(*(adopt(host, borrowed.family) for host in hosts)), arrays
-
-
 def _projection_plan(borrowed: Points, image_size: Sequence[int], cell: int, margin: float) -> PointProjection:
     return plan_for(
         PointProjection,
-        capacity=1 if borrowed.device == DEFAULT_DEVICE else capacity_for(len(borrowed)),
+        capacity=capacity_for(len(borrowed)),
         image_size=tuple(int(length) for length in image_size),
         occlusion_cell=int(cell),
         occlusion_margin=float(margin),
@@ -398,7 +324,19 @@ def project_points(
     borrowed = borrow_points(points)
     camera = camera_model(camera_from_lidar, intrinsics, distortion)
     plan = _projection_plan(borrowed, image_size, occlusion_cell, occlusion_margin)
-    return _projected(borrowed, plan, camera)[0]
+    n, family = len(borrowed), borrowed.family
+    count = count_on(n, borrowed.device)
+    if borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, count, camera)
+        return Projected(*(give(array[:n], family) for array in (plan.pixels, plan.depth, plan.visible)))
+    # Straight onto arrays of the caller's own.
+    hosts = (np.empty((n, 2), np.float32), np.empty(n, np.float32), np.empty(n, bool))
+    arrays = (
+        wp.array(host, dtype=dtype, copy=False, device=DEFAULT_DEVICE)
+        for host, dtype in zip(hosts, _RESULTS, strict=True)
+    )
+    plan._project_into(*arrays, borrowed.xyz, count, camera)
+    return Projected(*(adopt(host, family) for host in hosts))
 
 
 def paint_points(
@@ -442,16 +380,13 @@ def paint_points(
     height, width, channels = picture.shape
     projection = _projection_plan(borrowed, (width, height), occlusion_cell, occlusion_margin)
     plan = plan_for(PointPainting, channels=channels, projection=projection, method=method)
-    seen, (pixels, _, visible) = _projected(borrowed, projection, camera)
-    n = len(borrowed)
+    n, family = len(borrowed), borrowed.family
     count = count_on(n, borrowed.device)
     if borrowed.device != DEFAULT_DEVICE:
-        plan._paint_into(plan.values, pixels, visible, n, count, picture)
-        values = give(plan.values[:n], borrowed.family)
-    else:
-        host = np.empty((n, channels), np.float32)
-        array = wp.array(host, copy=False, device=DEFAULT_DEVICE)
-        plan._paint_into(array, pixels, visible, n, count, picture)
-        values = adopt(host, borrowed.family)
+        plan.launch(borrowed.xyz, count, camera, picture)
+        return Painted(give(plan.values[:n], family), give(projection.visible[:n], family))
+    hosts = (np.empty((n, channels), np.float32), np.empty(n, bool))
+    values, visible = (wp.array(host, copy=False, device=DEFAULT_DEVICE) for host in hosts)
+    plan._paint_into(values, visible, borrowed.xyz, count, camera, picture)
     del owner
-    return Painted(values, seen.visible)
+    return Painted(*(adopt(host, family) for host in hosts))

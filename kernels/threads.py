@@ -204,9 +204,11 @@ class PackedLaunch:
                 return
             self._record(given)
         else:
-            for command in self._commands:
-                for index, value in places.items():
-                    command.set_param_at_index(index, value)
+            first, *others = self._commands
+            for index, value in places.items():
+                first.set_param_at_index(index, value)
+                for other in others:  # the launch's bounds come before the parameters
+                    other.params[index + 1] = first.params[index + 1]
         if len(self._commands) == 1:
             self._commands[0].launch()
         else:
