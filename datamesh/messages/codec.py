@@ -38,7 +38,10 @@ _DEEPEST = 64
 _INT = struct.Struct("<q")
 _FLOAT = struct.Struct("<d")
 _COUNT = struct.Struct("<I")
-_SIZE = struct.Struct("<Q")
+_PLACE = struct.Struct("<IQ")
+_STR = ord("s")
+_forms: dict[bytes, tuple[np.dtype, int, struct.Struct]] = {}
+"""Types of arrays with their numbers of dimensions, by their bytes."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ def _put(value: Any, parts: list[Any], depth: int, place: Place | None = None) -
     elif (kind := _by_class.get(cls)) is not None:
         head, names = _heads(kind)
         parts.append(head)
-        for name, field in zip(kind.fields, names, strict=True):
+        for name, field in zip(kind.fields, names):  # noqa: B905  (as long as each other; strict takes longer)
             parts.append(field)
             try:
                 _put(getattr(value, name), parts, depth + 1, place)
@@ -210,11 +213,18 @@ def _put_array(array: np.ndarray, parts: list[Any], place: Place | None) -> None
     where = None if place is None or not array.size else place(array)
     shape = array.shape
     if where is not None:
-        parts.append(b"r" + _dtype_bytes(array.dtype) + struct.pack(f"<I{len(shape)}QIQ", len(shape), *shape, *where))
+        head, pack = _reference_head(array.dtype, len(shape))
+        parts.append(head + pack(*shape, *where))
         return
     parts.append(b"a" + _dtype_bytes(array.dtype) + struct.pack(f"<I{len(shape)}Q", len(shape), *shape))
     # A view of the memory: it is copied once, when the parts are joined. Dates have no buffer, bytes have.
     parts.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.size else b"")
+
+
+@functools.lru_cache(maxsize=256)
+def _reference_head(dtype: np.dtype, dimensions: int) -> tuple[bytes, Callable[..., bytes]]:
+    """What stands before the shape of an array by reference, and what packs its shape and where it lies."""
+    return b"r" + _dtype_bytes(dtype) + _COUNT.pack(dimensions), struct.Struct(f"<{dimensions}QIQ").pack
 
 
 @functools.lru_cache(maxsize=256)
@@ -282,15 +292,16 @@ class Decoder:
     """Reads values one after the other; never beyond the end, and never more than the bytes can hold."""
 
     def __init__(self, data: bytes | memoryview, memories: Sequence[np.ndarray] = ()) -> None:
-        self.data = memoryview(data).cast("B")
+        self.data = data if type(data) is bytes else memoryview(data).cast("B")
         self.position = 0
         self._memories = memories
 
-    def _take(self, size: int) -> memoryview:
-        if size > len(self.data) - self.position:
-            raise ValueError(f"truncated: {size} bytes expected at byte {self.position} of {len(self.data)}")
-        self.position += size
-        return self.data[self.position - size : self.position]
+    def _take(self, size: int) -> bytes:
+        position = self.position
+        self.position = end = position + size
+        if end > len(self.data):
+            raise ValueError(f"truncated: {size} bytes expected at byte {position} of {len(self.data)}")
+        return bytes(self.data[position:end])
 
     def _count(self) -> int:
         position = self.position
@@ -300,10 +311,10 @@ class Decoder:
         return _COUNT.unpack_from(self.data, position)[0]
 
     def _bytes(self) -> bytes:
-        return bytes(self._take(self._count()))
+        return self._take(self._count())
 
     def _text(self) -> str:
-        return self._bytes().decode("utf-8", "surrogatepass")
+        return self._take(self._count()).decode("utf-8", "surrogatepass")
 
     def value(self, depth: int = 0) -> Any:
         """The next value.
@@ -314,10 +325,13 @@ class Decoder:
         if depth > _DEEPEST:
             raise ValueError(f"nested deeper than {_DEEPEST} levels")
         place = self.position
-        kind = bytes(self._take(1))
+        if place >= len(self.data):
+            self._take(1)
+        kind = self.data[place]
         read = _READERS.get(kind)
         if read is None:
-            raise ValueError(f"no kind of value is called {kind!r}, at byte {place}")
+            raise ValueError(f"no kind of value is called {bytes((kind,))!r}, at byte {place}")
+        self.position = place + 1
         return read(self, depth + 1)
 
     def _items(self, depth: int) -> list[Any]:
@@ -340,23 +354,35 @@ class Decoder:
             result[key] = self.value(depth)
         return result
 
-    def _dtype(self, depth: int) -> np.dtype:
-        if self.data[self.position : self.position + 1] != b"s":
-            return _dtype_of(self.value(depth))
-        self.position += 1
-        return _dtype_named(self._text())
-
     def _form(self, depth: int) -> tuple[np.dtype, tuple[int, ...], int]:
         """Type, shape, and number of bytes of an array."""
-        dtype = self._dtype(depth)
-        dimensions = self._count()
-        if dimensions > 32:
-            raise ValueError(f"an array of {dimensions} dimensions")
-        shape = struct.unpack(f"<{dimensions}Q", self._take(8 * dimensions))
+        data, position = self.data, self.position
+        size = data[position + 1] if position + 1 < len(data) and data[position] == _STR else 0
+        if size and (form := _forms.get(bytes(data[position : position + size + 9]))):
+            self.position = position + size + 9  # the usual case: a type and number of dimensions that came before
+        else:
+            form = self._new_form(depth, position)
+        dtype, itemsize, shapes = form
+        position = self.position
+        if position + shapes.size > len(data):
+            self._take(shapes.size)
+        self.position = position + shapes.size
+        shape = shapes.unpack_from(data, position)
         size = math.prod(shape)
         if size == 0 and max(shape) >= 1 << 62:
             raise ValueError(f"an array of shape {shape}")
-        return dtype, shape, size * dtype.itemsize
+        return dtype, shape, size * itemsize
+
+    def _new_form(self, depth: int, start: int) -> tuple[np.dtype, int, struct.Struct]:
+        """Type, size of an element, and how the shape is packed."""
+        dtype = _dtype_of(self.value(depth))
+        dimensions = self._count()
+        if dimensions > 32:
+            raise ValueError(f"an array of {dimensions} dimensions")
+        form = dtype, dtype.itemsize, struct.Struct(f"<{dimensions}Q")
+        if self.data[start] == _STR and len(_forms) < 256:
+            _forms[bytes(self.data[start : self.position])] = form
+        return form
 
     def _array(self, depth: int) -> np.ndarray:
         dtype, shape, size = self._form(depth)
@@ -364,7 +390,7 @@ class Decoder:
 
     def _reference(self, depth: int) -> np.ndarray:
         dtype, shape, size = self._form(depth)
-        number, offset = self._count(), _SIZE.unpack(self._take(8))[0]
+        number, offset = _PLACE.unpack(self._take(_PLACE.size))
         if number >= len(self._memories):
             raise ValueError(f"an array in memory {number}, of which there are {len(self._memories)} here")
         memory = self._memories[number]
@@ -381,11 +407,18 @@ class Decoder:
 
     def _message(self, depth: int) -> Any:
         name = self._text()
-        values = {}
-        for _ in range(self._within(self._count())):
-            field = self._text()
-            values[field] = self.value(depth)
         kind = _by_name.get(name)
+        expected = () if kind is None else _heads(kind)[1]
+        values = {}
+        for number in range(self._within(self._count())):
+            position = self.position
+            end = position + len(expected[number]) if number < len(expected) else position
+            if end > position and self.data[position:end] == expected[number]:  # the usual case is not read
+                field = kind.fields[number]
+                self.position = end
+            else:
+                field = self._text()
+            values[field] = self.value(depth)
         if kind is None:
             raise ValueError(f"no type is registered as message {name!r}: import the module that defines it")
         if tuple(values) != kind.fields:
@@ -399,20 +432,23 @@ class Decoder:
             raise ValueError(f"message {name!r} cannot be made: {type(error).__name__}: {error}") from error
 
 
-_READERS: Mapping[bytes, Callable[[Decoder, int], Any]] = {
-    b"N": lambda decoder, depth: None,
-    b"T": lambda decoder, depth: True,
-    b"F": lambda decoder, depth: False,
-    b"i": lambda decoder, depth: _INT.unpack(decoder._take(8))[0],
-    b"I": lambda decoder, depth: int.from_bytes(decoder._bytes(), "little", signed=True),
-    b"f": lambda decoder, depth: _FLOAT.unpack(decoder._take(8))[0],
-    b"s": lambda decoder, depth: decoder._text(),
-    b"b": lambda decoder, depth: decoder._bytes(),
-    b"t": lambda decoder, depth: tuple(decoder._items(depth)),
-    b"l": Decoder._items,
-    b"d": Decoder._dict,
-    b"a": Decoder._array,
-    b"r": Decoder._reference,
-    b"n": Decoder._scalar,
-    b"m": Decoder._message,
+_READERS: Mapping[int, Callable[[Decoder, int], Any]] = {
+    ord(kind): read
+    for kind, read in {
+        "N": lambda decoder, depth: None,
+        "T": lambda decoder, depth: True,
+        "F": lambda decoder, depth: False,
+        "i": lambda decoder, depth: _INT.unpack(decoder._take(8))[0],
+        "I": lambda decoder, depth: int.from_bytes(decoder._bytes(), "little", signed=True),
+        "f": lambda decoder, depth: _FLOAT.unpack(decoder._take(8))[0],
+        "s": lambda decoder, depth: decoder._text(),
+        "b": lambda decoder, depth: decoder._bytes(),
+        "t": lambda decoder, depth: tuple(decoder._items(depth)),
+        "l": Decoder._items,
+        "d": Decoder._dict,
+        "a": Decoder._array,
+        "r": Decoder._reference,
+        "n": Decoder._scalar,
+        "m": Decoder._message,
+    }.items()
 }

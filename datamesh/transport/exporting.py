@@ -27,7 +27,7 @@ from ..window import Window
 from .config import SharedMemoryConfig
 from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
 from .slabs import Lease, Slab, SlabArena, SlabPool, Usage
-from .wire import COMMIT, INLINE, MESSAGE, RELEASE, SETTLE, Event, pack_event, pack_greeting, read_greeting
+from .wire import COMMIT, INLINE, MESSAGE, RELEASE, SETTLE, Event, new_event, pack_event, pack_greeting, read_greeting
 
 __all__ = ["ExportService", "Exporter"]
 
@@ -90,10 +90,11 @@ class ExportService:
 class _Reader:
     """A connection to a process that reads the topic."""
 
-    __slots__ = ("blocks", "held", "most", "name", "number", "reached", "slabs", "socket")
+    __slots__ = ("blocks", "held", "most", "name", "number", "reached", "send", "slabs", "socket")
 
     def __init__(self, connection: socket.socket, name: str, most: int, blocks: bool) -> None:
         self.socket = connection
+        self.send = connection.send
         self.name = name
         self.most = most
         """How many payloads it may hold."""
@@ -109,6 +110,54 @@ class _Reader:
 
 class _NoRoom(Exception):  # noqa: N818  (it is no error: the datum is dropped and counted)
     """The memory of the topic is full."""
+
+
+class _Placing:
+    """Says for each array of a payload in which slab it lies, and copies to one what lies in none."""
+
+    __slots__ = ("_expected", "_lease", "_pool", "copied_bytes", "copies", "leases", "slabs")
+
+    def __init__(self, pool: SlabPool, lease: Callable[[int], Lease | None], expected: int) -> None:
+        self._pool = pool
+        self._lease = lease
+        self._expected = expected
+        self.slabs: list[Slab] = []
+        """In the order of their numbers."""
+        self.leases: list[Lease] = []
+        """Of those that were taken for copies."""
+        self.copies: SlabArena | None = None
+        self.copied_bytes = 0
+
+    def take(self, size: int) -> Lease:
+        """A slab. Raises `_NoRoom`."""
+        found = self._lease(size)
+        if found is None:
+            raise _NoRoom
+        self.leases.append(found)
+        return found
+
+    def __call__(self, array: np.ndarray) -> tuple[int, int] | None:
+        """Number of the slab and offset in it; None for an array that goes with the message."""
+        found = self._pool.locate(array)
+        if found is None:
+            if array.nbytes <= _SMALL:
+                return None
+            found = self._pool.locate(self._copy(array))
+            assert found is not None
+        slab, offset = found
+        slabs = self.slabs
+        if slab in slabs:
+            return slabs.index(slab), offset
+        slabs.append(slab)
+        return len(slabs) - 1, offset
+
+    def _copy(self, array: np.ndarray) -> np.ndarray:
+        if self.copies is None:
+            self.copies = SlabArena(self.take, self._expected, lambda: None)
+        copy = self.copies.array(array.shape, array.dtype)
+        np.copyto(copy, array)
+        self.copied_bytes += array.nbytes
+        return copy
 
 
 class Exporter:
@@ -146,6 +195,7 @@ class Exporter:
         self._reached: dict[str, tuple[int, int]] = {}
         self._stopped = False
         self._built = self._copied = Usage()
+        self._newest = self._newest_of(window)
         self._listener = listen(node, window.topic)
         try:
             self.order = OrderFile(node, window.topic)
@@ -183,6 +233,11 @@ class Exporter:
             self._pool.close()
             self.order.close()
 
+    @staticmethod
+    def _newest_of(window: Window[Any]) -> tuple[int, int]:
+        snapshot = window.snapshot()
+        return snapshot.epoch, snapshot.versions[-1] if len(snapshot) else -1
+
     # Memory
 
     def _arena(self) -> SlabArena:
@@ -208,11 +263,15 @@ class Exporter:
         with self._lock:
             if self._stopped:
                 return
-            epoch = self.order.epoch(entry.epoch, entry.version)
-            self._counts["commits"] += 1
+            version = entry.version
+            epoch = self.order.epoch(entry.epoch, version)
+            order = (entry.epoch, version)
+            newest = order > self._newest or self._window.snapshot().versions[-1] == version
+            if newest:
+                self._newest = order
             if self._readers:
-                newest = self._window.snapshot().versions[-1] == entry.version
                 self._tell(entry, epoch, newest, self._readers)
+            self._counts["commits"] += 1
 
     def _on_settle(self, version: int, epoch: int) -> None:
         with self._lock:
@@ -253,50 +312,26 @@ class Exporter:
             _NoRoom: There is no room to copy it to.
             TypeError: It has no form as a message.
         """
-        slabs: list[Slab] = []
-        leases: list[Lease] = []
-        copies: SlabArena | None = None
-
-        def take(size: int) -> Lease:
-            found = self._lease(size)
-            if found is None:
-                raise _NoRoom
-            leases.append(found)
-            return found
-
-        def place(array: np.ndarray) -> tuple[int, int] | None:
-            nonlocal copies
-            found = self._pool.locate(array)
-            if found is None:
-                if array.nbytes <= _SMALL:
-                    return None
-                if copies is None:
-                    copies = SlabArena(take, self._copied.size, lambda: None)
-                copy = copies.array(array.shape, array.dtype)
-                np.copyto(copy, array)
-                self._counts["copied_bytes"] += array.nbytes
-                found = self._pool.locate(copy)
-                assert found is not None
-            if found[0] not in slabs:
-                slabs.append(found[0])
-            return slabs.index(found[0]), found[1]
-
-        # On the host: what a device still writes is waited for.
-        value = entry.value if entry.completion is None else entry.read()
-        body = encode(value, place)
-        size = 0
-        if copies is not None:
+        version, value, received, committed, _, triggers, completion, _ = entry
+        if completion is not None:  # on the host: what a device still writes is waited for
+            value = entry.read()
+        placing = _Placing(self._pool, self._lease, self._copied.size)
+        body, size = encode(value, placing), 0
+        slabs = placing.slabs
+        if placing.copies is not None:
             self._counts["copied"] += 1
-            self._copied = copies.used
+            self._counts["copied_bytes"] += placing.copied_bytes
+            self._copied = placing.copies.used
         if len(body) > INLINE:
-            one = take(len(body))
+            one = placing.take(len(body))
             one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
             slabs.append(one.key)
             size, body = len(body), b""
-        parts = tuple([(slab.offset, slab.size) for slab in slabs])
-        stamps = entry.received_ns, entry.committed_ns
-        event = Event(COMMIT, 0, epoch, entry.version, *stamps, entry.triggers, newest, parts, body, size)
-        return event, slabs, leases
+        parts: tuple[tuple[int, int], ...] = ()
+        for slab in slabs:
+            parts += ((slab.offset, slab.size),)
+        event = new_event((COMMIT, 0, epoch, version, received, committed, triggers, newest, parts, body, size))
+        return event, slabs, placing.leases
 
     # Readers
 
@@ -388,7 +423,7 @@ class Exporter:
             if reader.held >= reader.most:
                 return False
         try:
-            reader.socket.send(data)
+            reader.send(data)
         except BlockingIOError:
             self._collect(reader)
             return False

@@ -14,6 +14,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from ...errors import SourceError
@@ -29,6 +30,10 @@ from .wire import MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, re
 __all__ = ["Importer", "publish"]
 
 _log = logging.getLogger(__name__)
+
+# Members of enums take longer to look up than to compare.
+_OVERWRITE, _INSERT_SORTED, _REPLACE = CommitPolicy.OVERWRITE, CommitPolicy.INSERT_SORTED, EqualVersion.REPLACE
+_new_entry = partial(tuple.__new__, Entry)
 
 _STOP_S = 5.0
 """How long a component whose backlog blocks may keep the thread that receives."""
@@ -47,7 +52,7 @@ class _Connection:
 
     def lease(self, slab: tuple[int, int]) -> Lease:
         """A slab, which the writer is told of when it is no longer needed."""
-        return Lease(self.region, *slab, slab[0], self._let_go)
+        return self.region.lease(*slab, slab[0], self._let_go)
 
     def _let_go(self, offset: int) -> None:
         # Called wherever the last array of a slab ends, in whatever thread: it takes no lock and never waits.
@@ -250,7 +255,9 @@ def _value(connection: _Connection, event: Event) -> Any:
     Raises:
         ValueError: It is damaged, or of a type that is not registered.
     """
-    memories = [connection.lease(slab).bytes() for slab in event.slabs]
+    memories = []
+    for slab in event.slabs:  # a comprehension would be one more call
+        memories.append(connection.lease(slab))
     body = memories[-1][: event.body_size].tobytes() if event.body_size else event.body
     return decode(body, memories)
 
@@ -263,11 +270,11 @@ def publish(window: Window[Any], event: Event, value: Any) -> None:
         event: The commit there.
         value: Its payload.
     """
-    if not event.newest:
-        snapshot = window.snapshot(event.epoch)
-        index = snapshot.version_index(event.version)
-        if index >= 0 and snapshot.entry(index).committed_ns == event.committed_ns:
-            return  # sent again, after the connection was lost
-    entry = Entry(event.version, value, event.received_ns, event.committed_ns, event.epoch, event.triggers)
-    policy = CommitPolicy.OVERWRITE if event.newest else CommitPolicy.INSERT_SORTED
-    window.commit(policy, entry, EqualVersion.REPLACE, None if event.newest else event.triggers)
+    _, _, epoch, version, received, committed, triggers, newest, _, _, _ = event
+    entry = _new_entry((version, value, received, committed, epoch, triggers, None, None))
+    if newest:
+        window.commit(_OVERWRITE, entry, _REPLACE)
+        return
+    there = window.find(version, epoch)
+    if there is None or there.committed_ns != committed:  # else it is sent again, after the connection was lost
+        window.commit(_INSERT_SORTED, entry, _REPLACE, triggers)

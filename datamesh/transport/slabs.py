@@ -28,38 +28,37 @@ _ALIGNMENT = 64
 """Of each array in a slab [B]: a cache line, and the widest vector."""
 
 
-class Lease:
-    """A part of a region, kept for as long as an array of it lives: arrays made of it hold it as their base."""
+class Lease(np.ndarray):
+    """A part of a region, shape (size,), uint8, kept for as long as an array of it lives.
 
-    __slots__ = ("__array_interface__", "_on_end", "_region", "key")
+    Arrays are made of it by `np.ndarray(shape, dtype, lease, offset)`. They hold it as their base: it is of a class of
+    its own, and so is what it is cut from, so that NumPy does not look for a base further down.
+    """
 
-    def __init__(self, region: Region, offset: int, size: int, key: Any, on_end: Callable[[Any], None]) -> None:
-        """Leases.
-
-        Args:
-            region: The memory.
-            offset: Where the part begins in it [B].
-            size: Of the part [B].
-            key: What `on_end` is told.
-            on_end: Is called when the last array is gone, in any thread and at any place: it must take no lock.
-        """
-        self._region = region
-        self.key = key
-        self._on_end = on_end
-        address = region.address + offset
-        self.__array_interface__ = {
-            "version": 3,
-            "data": (address, not region.writable),
-            "shape": (size,),
-            "typestr": "|u1",
-        }
+    key: Any = None
+    """What `on_end` is told."""
+    begin = 0
+    """Where it begins in the region [B]."""
+    whole: Lease | None = None
+    """The lease that it is a part of, and keeps."""
+    on_end: Callable[[Any], None] | None = None
+    """Is called when the last array is gone, in any thread and at any place: it must take no lock."""
 
     def __del__(self) -> None:
-        self._on_end(self.key)
+        if self.on_end is not None:
+            self.on_end(self.key)
 
     def bytes(self) -> np.ndarray:
-        """The part, shape (size,), uint8."""
-        return np.asarray(self)
+        """The part as an array that keeps it; a slice of the lease itself would not."""
+        return np.ndarray(self.shape, np.uint8, self)
+
+    def part(self, begin: int, size: int) -> Lease:
+        """A part of it, which keeps it."""
+        part = self[begin : begin + size]
+        part.begin = self.begin + begin
+        part.key = self.key
+        part.whole = self
+        return part
 
 
 class Region:
@@ -84,8 +83,8 @@ class Region:
         self.size = size
         self.writable = writable
         self._map = mmap.mmap(fd, size, mmap.MAP_SHARED, protection)
-        # The array holds the map, and with it the memory, for as long as a lease holds the region.
-        self._bytes = np.frombuffer(self._map, np.uint8)
+        # The array holds the map, and with it the memory, and is held by what is cut from it.
+        self._bytes = np.frombuffer(self._map, np.uint8).view(Lease)
         self.address: int = self._bytes.__array_interface__["data"][0]
 
     @staticmethod
@@ -104,26 +103,34 @@ class Region:
         finally:
             os.close(fd)
 
-    def view(self, offset: int, size: int) -> np.ndarray:
-        """A part of it that no lease protects, shape (size,), uint8."""
-        return self._bytes[offset : offset + size]
+    def lease(self, offset: int, size: int, key: Any, on_end: Callable[[Any], None]) -> Lease:
+        """A part of it.
+
+        Args:
+            offset: Where it begins [B].
+            size: Of the part [B].
+            key: What `on_end` is told.
+            on_end: As `Lease` says.
+        """
+        lease = self._bytes[offset : offset + size]
+        lease.begin = offset
+        lease.key = key
+        lease.on_end = on_end
+        return lease
 
 
 class Slab:
     """One block of a pool; free again once nobody holds it."""
 
-    __slots__ = ("holders", "offset", "order")
+    __slots__ = ("holders", "offset", "order", "size")
 
     def __init__(self, offset: int, order: int) -> None:
         self.offset = offset
         self.order = order
+        self.size = PAGE << order
+        """[B]."""
         self.holders = 0
         """Leases of this process, and readers that have not let go of it."""
-
-    @property
-    def size(self) -> int:
-        """[B]."""
-        return PAGE << self.order
 
 
 class SlabPool:
@@ -181,7 +188,7 @@ class SlabPool:
     def lease(self, slab: Slab) -> Lease:
         """Holds a slab for as long as an array of it lives in this process."""
         slab.holders += 1
-        return Lease(self.region, slab.offset, slab.size, slab, self._ended.append)
+        return self.region.lease(slab.offset, slab.size, slab, self._ended.append)
 
     def release(self, slab: Slab) -> None:
         """One who held it lets go."""
@@ -206,6 +213,9 @@ class SlabPool:
 
     def locate(self, array: np.ndarray) -> tuple[Slab, int] | None:
         """The slab in which an array lies, one piece in C order, and where; None where it lies elsewhere."""
+        base = array.base
+        if type(base) is Lease and type(slab := base.key) is Slab and self._slabs.get(slab.offset) is slab:
+            return slab, base.begin - slab.offset  # as it was made: to ask where an array lies takes long
         interface = array.__array_interface__
         if interface["strides"] is not None:
             return None
@@ -244,7 +254,8 @@ class SlabArena:
         self._lease = lease
         self._expected = expected
         self._on_full = on_full
-        self._room: np.ndarray = np.empty(0, np.uint8)
+        self._room: Lease | None = None
+        self._begin = self._end = 0
         self.used = Usage()
 
     def array(self, shape: Any, dtype: Any) -> np.ndarray:
@@ -257,13 +268,13 @@ class SlabArena:
             raise ValueError(f"an array of shape {shape}")
         size = math.prod(shape) * dtype.itemsize
         taken = -(-size // _ALIGNMENT) * _ALIGNMENT
-        if taken > len(self._room):
+        if self._room is None or taken > self._end - self._begin:
             lease = self._lease(max(taken, self._expected - self.used.size))
             if lease is None:
                 self._on_full()
                 return np.empty(shape, dtype)
-            self._room = lease.bytes()
-        array = self._room[:size].view(dtype).reshape(shape)
-        self._room = self._room[taken:]
+            self._room, self._begin, self._end = lease, 0, lease.size
+        array = np.ndarray(shape, dtype, self._room.part(self._begin, size))
+        self._begin += taken
         self.used.size += taken
         return array

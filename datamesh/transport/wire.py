@@ -11,18 +11,30 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from ..messages import decode, encode
 
-__all__ = ["COMMIT", "INLINE", "MESSAGE", "RELEASE", "SETTLE", "Event", "pack_event", "pack_greeting", "read_greeting"]
+__all__ = [
+    "COMMIT",
+    "INLINE",
+    "MESSAGE",
+    "RELEASE",
+    "SETTLE",
+    "Event",
+    "new_event",
+    "pack_event",
+    "pack_greeting",
+    "read_greeting",
+]
 
 INLINE = 4096
 """The longest body in a message [B]."""
 MESSAGE = 1 << 15
 """The longest message that is received [B]."""
 RELEASE = struct.Struct("<Q")
-COMMIT, SETTLE = 1, 2
+COMMIT, SETTLE = _KINDS = (1, 2)
 _TRIGGERS, _NEWEST, _IN_SLAB = 1, 2, 4
 _HEAD = struct.Struct("<BBHIQQQqq")
 _SLAB = struct.Struct("<QQ")
@@ -51,21 +63,18 @@ class Event(NamedTuple):
     """Of the payload there."""
 
 
+new_event = partial(tuple.__new__, Event)  # what a named tuple calls is written in Python, and takes twice as long
+
+
 def pack_event(event: Event, number: int | None = None) -> bytes:
     """An event as bytes, under another number where one is given."""
-    flags = _TRIGGERS * event.triggers | _NEWEST * event.newest | _IN_SLAB * (event.body_size > 0)
-    head = _HEAD.pack(
-        event.kind,
-        flags,
-        len(event.slabs),
-        event.body_size,
-        event.number if number is None else number,
-        event.epoch,
-        event.version,
-        event.received_ns,
-        event.committed_ns,
-    )
-    return b"".join((head, *(_SLAB.pack(*slab) for slab in event.slabs), event.body))
+    kind, own, epoch, version, received, committed, triggers, newest, slabs, body, body_size = event
+    flags = (_TRIGGERS if triggers else 0) | (_NEWEST if newest else 0) | (_IN_SLAB if body_size else 0)
+    number = own if number is None else number
+    data = _HEAD.pack(kind, flags, len(slabs), body_size, number, epoch, version, received, committed)
+    for offset, size in slabs:
+        data += _SLAB.pack(offset, size)
+    return data + body
 
 
 def read_event(data: bytes, memory: int) -> Event:
@@ -81,30 +90,25 @@ def read_event(data: bytes, memory: int) -> Event:
     if len(data) < _HEAD.size:
         raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD.size}")
     kind, flags, count, body_size, number, epoch, version, received, committed = _HEAD.unpack_from(data)
-    if kind not in (COMMIT, SETTLE) or flags >= 8 or count > _MOST_SLABS:
+    if kind not in _KINDS or flags >= 8 or count > _MOST_SLABS:
         raise ValueError(f"no event: kind {kind}, flags {flags}, {count} slabs")
     end = _HEAD.size + count * _SLAB.size
     if len(data) < end:
         raise ValueError(f"truncated: {count} slabs expected in {len(data) - _HEAD.size} bytes")
-    slabs = tuple([_SLAB.unpack_from(data, at) for at in range(_HEAD.size, end, _SLAB.size)])
-    for offset, size in slabs:
+    slabs: tuple[tuple[int, int], ...] = ()
+    for at in range(_HEAD.size, end, _SLAB.size):
+        slab = offset, size = _SLAB.unpack_from(data, at)
         if size == 0 or offset + size > memory:
             raise ValueError(f"a slab at {offset} of {size} bytes in a memory of {memory}")
-    if flags & _IN_SLAB and (not slabs or not 0 < body_size <= slabs[-1][1]):
+        slabs += (slab,)
+    if not flags & _IN_SLAB:
+        body_size = 0
+    elif not slabs or not 0 < body_size <= slabs[-1][1]:
         raise ValueError(f"a payload of {body_size} bytes in {slabs[-1][1] if slabs else 0} bytes of a slab")
-    return Event(
-        kind,
-        number,
-        epoch,
-        version,
-        received,
-        committed,
-        bool(flags & _TRIGGERS),
-        bool(flags & _NEWEST),
-        slabs,
-        memoryview(data)[end:],
-        body_size if flags & _IN_SLAB else 0,
-    )
+    triggers, newest = flags & _TRIGGERS != 0, flags & _NEWEST != 0
+    # What comes over zenoh may be long, and is not to be copied.
+    body = data[end:] if len(data) <= MESSAGE else memoryview(data)[end:]
+    return new_event((kind, number, epoch, version, received, committed, triggers, newest, slabs, body, body_size))
 
 
 def pack_greeting(content: Mapping[str, Any]) -> bytes:

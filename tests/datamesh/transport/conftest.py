@@ -16,7 +16,7 @@ from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
 from warploom.datamesh.transport import SharedMemoryConfig
 
 PEER = pathlib.Path(__file__).with_name("peer.py")
-PATIENCE = 30.0  # [s] for what takes milliseconds on a machine that is not busy
+PATIENCE = 120.0  # [s] for what takes milliseconds, and a process that starts a second, on a machine that is not busy
 
 
 def until(condition, what="it"):

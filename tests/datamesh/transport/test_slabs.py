@@ -87,6 +87,25 @@ def test_a_slab_is_free_again_when_the_last_array_of_it_is_gone(pool):
     assert used(pool) == 0
 
 
+def test_any_array_of_a_change_keeps_its_slab_and_is_located_however_it_was_cut(pool):
+    slab = pool.take(PAGE)
+    arena = SlabArena(lambda size: pool.lease(slab), PAGE, lambda: None)
+    first, second = arena.array((8, 3), np.float32), arena.array(5, np.int64)
+    del arena
+    assert pool.locate(first) == (slab, 0)
+    assert pool.locate(second) == (slab, 128)
+    assert pool.locate(first[2:6]) == (slab, 24)
+    assert pool.locate(second[:3].view(np.uint8)) == (slab, 128)
+    assert pool.locate(first[:, 1]) is None
+    part = second[1:].reshape(2, 2)
+    del first, second
+    gc.collect()
+    assert used(pool) == 1
+    del part
+    gc.collect()
+    assert used(pool) == 0
+
+
 def test_a_slab_that_a_reader_holds_stays_when_the_arrays_are_gone(pool):
     slab = pool.take(PAGE)
     lease = pool.lease(slab)
@@ -113,7 +132,7 @@ def test_a_reader_sees_what_the_writer_writes_and_cannot_write(pool):
     written = pool.lease(slab).bytes()
     written[:] = 7
     region = Region(pool.fd, SIZE, writable=False)
-    read = region.view(slab.offset, slab.size)
+    read = region.lease(slab.offset, slab.size, None, lambda _: None).bytes()
     assert (read == 7).all()
     written[5] = 8
     assert read[5] == 8, "it is the same memory"
