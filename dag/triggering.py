@@ -12,6 +12,8 @@ from .trigger import Trigger
 
 __all__ = ["AllTrigger", "AnyTrigger", "TimeTrigger", "TriggerSource"]
 
+_READINGS = 8
+"""How often both times of the clock are read until no time passes in between."""
 _REMEMBERED = 256
 """How many versions a source knows one by one: those that triggered, and those that it waits to complete."""
 
@@ -285,10 +287,10 @@ class TimeTrigger(TriggerSource):
         with self._lock:
             if not self._ticking:
                 return
-            at = self._clock.monotonic_ns()
+            at, now = self._times()
             missed = max(0, at - due_ns) // self._period
             late = at - due_ns - missed * self._period
-            self._version = version = self._next_version(self._clock.now_ns() - late, missed)
+            self._version = version = self._next_version(now - late, missed)
             self._schedule(due_ns + (missed + 1) * self._period)
         if missed:
             self._losses.count(self._place, "overrun", version, amount=missed)
@@ -297,6 +299,19 @@ class TimeTrigger(TriggerSource):
             self._losses.count(self._place, "overrun", version)
             trigger = trigger._replace(settled=True)
         self.offer(trigger)
+
+    def _times(self) -> tuple[int, int]:
+        """Both times of the clock, of one moment.
+
+        A thread that loses its core between the two would find the clock set forward, and at the next tick set back:
+        where that took long they are read again.
+        """
+        at = now = 0
+        for _ in range(_READINGS):
+            at, now = self._clock.monotonic_ns(), self._clock.now_ns()
+            if self._clock.monotonic_ns() - at < self._period // 8:
+                break
+        return at, now
 
     def _next_version(self, now: int, missed: int) -> int:
         last = self._version

@@ -263,6 +263,26 @@ def test_a_clock_that_is_set_back_begins_an_epoch_and_one_set_forward_does_not()
     ]
 
 
+def test_a_thread_that_loses_its_core_between_two_readings_begins_no_epoch():
+    """On a busy machine that happens; the clock itself goes on evenly."""
+    ticks = Ticks()
+    ticks.source.start()
+    now_ns, losses_of_the_core = ticks.clock.now_ns, iter([0, 130, 0, 0, 260, 90, 0])
+
+    def late_now_ns():
+        ticks.clock._elapsed += next(losses_of_the_core, 0) * MS
+        return now_ns()
+
+    ticks.clock.now_ns = late_now_ns
+    for _ in range(100):
+        ticks.clock.advance(10 * MS)
+    taken = ticks.taken()
+    assert {epoch for epoch, _, _ in taken} == {0}
+    versions = [version for _, version, _ in taken]
+    assert versions == sorted(set(versions))
+    assert all(version % 100 == 0 for version in versions), "on the grid that the first tick has begun"
+
+
 def test_versions_do_not_shake_with_the_clocks_thread():
     ticks = Ticks()
     ticks.source.start()
