@@ -31,7 +31,7 @@ from .mesh import DataMesh
 from .messages import decode, encode, message_type
 from .snapshot import Entry
 
-__all__ = ["ENCODING", "HEADER", "LOSSES", "READS", "RUNS", "EventKind", "RecordedEvent", "Recorder", "digest"]
+__all__ = ["ENCODING", "GAPS", "HEADER", "LOSSES", "READS", "RUNS", "EventKind", "RecordedEvent", "Recorder", "digest"]
 
 ENCODING = "warploom"
 """Of channels and of messages."""
@@ -41,6 +41,9 @@ LOSSES = "warploom/losses"
 """The topic of what was lost: a tuple of place and reason."""
 RUNS = "warploom/runs"
 """The topic of triggers that components took: the component, and the versions that triggered, by input."""
+GAPS = "warploom/gaps"
+"""The topic of what a recording does not continue: a topic, the epoch and version up to which the file before holds it,
+the version from which this one does, and the name of the file before."""
 READS = "warploom/reads"
 """The topic of what sync vertices read: the vertex, and by input epoch and version, or how the wait ended without; None
 where the vertex was left out."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import heapq
 import os
+import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,13 @@ __all__ = ["Recording"]
 
 _LARGEST = 1 << 30
 """Bytes of one record or chunk [B]: what claims more is damaged."""
+_MAGIC = b"\x89MCAP0\r\n"
+_MAGIC_BYTES = len(_MAGIC)
+_RECORD = struct.Struct("<BQ")
+"""How a record of MCAP begins: its opcode, and the length of the rest."""
+_CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x04, 0x05, 0x06, 0x0F
+_MESSAGE_HEADER = struct.Struct("<H12xQB7xQ")
+"""Of a message of ours: channel, publish time (the version), kind, epoch."""
 _OUT_OF_ORDER = 16
 """By how many messages the file's order may differ from the order of commits: what a commit leads to can be told to the
 recorder before the commit itself."""
@@ -113,6 +122,59 @@ class Recording:
                 break
         while waiting:
             yield heapq.heappop(waiting)[2]
+
+    @property
+    def closed(self) -> bool:
+        """Whether its recorder came to the end; otherwise it was killed, or is at work."""
+        try:
+            with self.path.open("rb") as file:
+                file.seek(-_MAGIC_BYTES, os.SEEK_END)
+                return self.size > 2 * _MAGIC_BYTES and file.read() == _MAGIC
+        except OSError as error:
+            raise SourceError(f"{self.path}: cannot be read: {error.strerror or error}") from None
+
+    def ends(self) -> dict[str, tuple[int, int]]:
+        """By topic, epoch and version of the newest commit; payloads are passed over, so that this takes no time.
+
+        Raises:
+            SourceError: The file cannot be read any more.
+        """
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Channel
+
+        topics: dict[int, str] = {}
+        ends: dict[str, tuple[int, int]] = {}
+        try:
+            with self.path.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                at = _MAGIC_BYTES
+                while at + _RECORD.size <= size:
+                    file.seek(at)
+                    opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+                    at += _RECORD.size + length
+                    if at > size or opcode == _DATA_END:
+                        break
+                    if opcode == _CHUNK:  # what is collected and compressed has to be read
+                        return self._ends_of_chunks()
+                    if opcode == _CHANNEL:
+                        channel = Channel.read(ReadDataStream(BytesIO(file.read(length))))
+                        if channel.message_encoding == ENCODING:
+                            topics[channel.id] = channel.topic
+                    elif opcode == _MESSAGE and length >= _MESSAGE_HEADER.size:
+                        number, version, kind, epoch = _MESSAGE_HEADER.unpack(file.read(_MESSAGE_HEADER.size))
+                        if number in topics and kind == EventKind.COMMIT:
+                            topic = topics[number]
+                            ends[topic] = max(ends.get(topic, (epoch, version)), (epoch, version))
+        except OSError as error:
+            raise SourceError(f"{self.path}: cannot be read: {error.strerror or error}") from None
+        return ends
+
+    def _ends_of_chunks(self) -> dict[str, tuple[int, int]]:
+        ends: dict[str, tuple[int, int]] = {}
+        for event in self:
+            if event.kind is EventKind.COMMIT:
+                ends[event.topic] = max(ends.get(event.topic, (0, 0)), (event.epoch, event.version))
+        return ends
 
     def _event(self, channel: Channel, message: Message) -> RecordedEvent | None:
         if channel.message_encoding != ENCODING or len(message.data) < HEADER.size:

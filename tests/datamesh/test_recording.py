@@ -244,6 +244,36 @@ def test_a_truncated_recording_is_read_up_to_the_break(whole, tmp_path, fraction
         assert "breaks off" in recording.broken
 
 
+@pytest.mark.parametrize("write_through", [True, False])
+def test_where_each_topic_ends_is_told_of_whole_and_of_truncated_recordings(tmp_path, write_through):
+    """The reference: the events as they are read one by one."""
+    mesh = DataMesh()
+    path = tmp_path / "whole.mcap"
+    with Recorder(path, write_through=write_through) as recorder:
+        recorder.watch(mesh, ["noise", "text"])
+        for version in range(60):
+            commit(mesh, "noise", version, np.random.default_rng(version).normal(size=10_000))
+            if version % 7 == 0:
+                commit(mesh, "text", version, "x" * version)
+            output_of(mesh, "text").settle(version + 1)
+        mesh.window("noise").new_epoch()
+        commit(mesh, "noise", 3, np.zeros(3))
+    data = path.read_bytes()
+    assert Recording(path).closed
+    assert Recording(path).ends() == {"noise": (1, 3), "text": (0, 56)}
+    seen = set()
+    for size in np.linspace(len(data) // 20, len(data) - 1, 40).astype(int):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(data[:size])
+        recording = Recording(cut)
+        events = [event for event in recording if event.kind is EventKind.COMMIT]
+        expected = {t: max((e.epoch, e.version) for e in events if e.topic == t) for t in {e.topic for e in events}}
+        assert not recording.closed
+        assert recording.ends() == expected
+        seen.add(tuple(sorted(expected.items())))
+    assert len(seen) > 3
+
+
 def test_damage_within_is_told_and_what_comes_before_is_read(whole, tmp_path):
     data = bytearray(whole.read_bytes())
     data[len(data) // 2] ^= 0xFF

@@ -11,7 +11,7 @@ import pytest
 from warploom.components.node.recorder import TopicRecorder
 from warploom.dag import Process, load_module
 from warploom.datamesh import CommitPolicy, Output
-from warploom.datamesh.recording import EventKind
+from warploom.datamesh.recording import GAPS, EventKind
 from warploom.datamesh.recording_reader import Recording
 from warploom.errors import ConfigError, SinkError
 
@@ -73,6 +73,60 @@ def test_each_start_makes_a_file_of_its_own(process, tmp_path):
     name = next(path.parent.iterdir()).name
     assert name.startswith("run-2")
     assert name.endswith(f"-{os.getpid()}.mcap")
+
+
+def cut_short(path):
+    """What a killed recorder leaves: the file without its end."""
+    data = path.read_bytes()
+    path.write_bytes(data[: data.rindex(b"warploom.end") - 20])
+
+
+def test_after_a_kill_it_goes_on_in_a_further_file_and_says_what_is_missing(process, tmp_path):
+    first = process()
+    first.start()
+    for version in (1, 2, 3):
+        commit(first, "a", version, version)
+        commit(first, "b", version, version)
+    first.stop()
+    before = next((tmp_path / "out").iterdir())
+    before = before.rename(before.with_stem("run-20260101T000000-1"))
+    cut_short(before)
+    second = process()
+    second.start()
+    for version in (2, 3, 4):  # what the producer keeps reaches back to the end of the file before
+        commit(second, "a", version, version)
+    for version in (7, 8):  # here it does not
+        commit(second, "b", version, version)
+    said = second.components["recorder"].state()
+    assert (said["continues"], said["gaps"]) == (before.name, 1)
+    assert second.mesh.losses.as_dict()["recorder b"] == {"gap": 1}
+    second.stop()
+    path = next(path for path in (tmp_path / "out").iterdir() if path != before)
+    recording = Recording(path)
+    gaps = [event for event in recording if event.topic == GAPS]
+    assert [(event.version, event.value) for event in gaps] == [(7, ("b", 0, 3, 7, before.name))]
+    assert recording.metadata["continues"] == before.name
+    assert commits(path) == [("a", 2, 2), ("a", 3, 3), ("a", 4, 4), ("b", 7, 7), ("b", 8, 8)]
+    third = process()
+    third.start()
+    assert "continues" not in third.components["recorder"].state(), "the one before was closed"
+    third.stop()
+
+
+def test_a_file_of_another_node_or_recorder_is_not_continued(process, tmp_path, monkeypatch):
+    one = process()
+    one.start()
+    commit(one, "a", 1, 1)
+    one.stop()
+    path = next((tmp_path / "out").iterdir())
+    cut_short(path)
+    (tmp_path / "out" / "run-0.mcap").write_bytes(b"no recording")
+    monkeypatch.setattr("warploom.components.node.recorder._session", lambda: "another start of the node")
+    two = process()
+    two.start()
+    commit(two, "a", 9, 9)
+    assert "gaps" not in two.components["recorder"].state()
+    two.stop()
 
 
 def test_bad_configurations_and_folders_are_told(process, tmp_path):
