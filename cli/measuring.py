@@ -44,20 +44,23 @@ def bench(
 def eval_tracking(
     data: Annotated[
         str,
-        typer.Option("--data", help="KITTI's tracking set: label_02/, calib/, oxts/; or a drive, such as sim:street."),
+        typer.Option(
+            "--data", help="KITTI's tracking set: label_02/, calib/, oxts/; or drives, such as sim:occlusion?seeds=1-8."
+        ),
     ],
     detections: Annotated[
         Path | None,
         typer.Option(
             "--detections",
             help="Folder of SSSS.txt with the detections of a type, or its name in DATA; "
-            "without it the profile's own head and clusters find the objects in the scans.",
+            "without it the profile's own head and clusters find the objects in the scans; "
+            "truth: of a drive, the true boxes of what can be seen.",
         ),
     ] = None,
     sequences: Annotated[
         str, typer.Option("--sequences", help="Such as 0001,0012; by default all with labels and detections.")
     ] = "",
-    out: Annotated[Path, typer.Option(help="Folder for result files, summary.json and recall.png.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder for result files, summary.json and plots over recall.")] = Path(
         "warploom-eval"
     ),
     tracker: Annotated[
@@ -76,22 +79,23 @@ def eval_tracking(
 
     Example: `warploom eval tracking --data kitti_tracking --detections pointrcnn_Car --out car`
     Example: `warploom eval tracking --data kitti_tracking --sequences 0000`
-    Example: `warploom eval tracking --data "sim:occlusion?seed=3&duration=9"`
+    Example: `warploom eval tracking --data "sim:occlusion?seeds=1-8&duration=7" --detections truth`
     """
     from ..components.evaluation import tracking, tracking_objects
     from ..components.perception.tracker_settings import load_tracker
 
     names = [name for name in sequences.split(",") if name]
     if ":" in data and not Path(data).exists():
-        lines = tracking_objects.lines_of_drive(
-            tracking_objects.evaluate_drive(data, profile=profile, settings=settings or ())
+        if detections is not None and str(detections) != "truth":
+            raise typer.BadParameter("of a drive it is truth, or left out", param_hint="--detections")
+        result = tracking_objects.evaluate_drives(
+            data, out, profile=profile, settings=settings or (), true_detections=detections is not None
         )
+        lines = tracking_objects.lines_of_drives(result)
     elif detections is None:
-        found = [
-            result
-            for name in names or ["0000"]
-            for result in tracking_objects.evaluate_scans(Path(data), name, profile=profile, settings=settings or ())
-        ]
+        found = tracking_objects.evaluate_scans(
+            Path(data), names or ["0000"], out, profile=profile, settings=settings or ()
+        )
         lines = [line for result in found for line in tracking.lines_of(result)]
     else:
         config = load_tracker(tracker, settings or ())
@@ -100,3 +104,4 @@ def eval_tracking(
         )
     for line in lines:
         typer.echo(line)
+    typer.echo(f"outputs in {out}/")

@@ -14,11 +14,13 @@ from ..models.detections import Detections
 
 __all__ = [
     "CameraObjects",
+    "CameraSet",
     "DetectedObjects",
     "Obstacle",
     "Obstacles",
     "PointLabels",
     "RadarObjects",
+    "RadarSet",
     "SensorFrame",
     "Truth",
 ]
@@ -79,6 +81,10 @@ class SensorFrame:
     continues: bool = True
     """False where it has nothing to do with the frame before, as in a data set of single scans: tracks begin anew."""
     truth: Truth | None = None
+    cameras: CameraSet | None = None
+    """What the cameras of the same vehicle found since the sweep before, where the source knows it."""
+    radars: RadarSet | None = None
+    """Likewise the targets of its radars."""
 
 
 @message("warploom.DetectedObjects")
@@ -141,6 +147,26 @@ class RadarObjects:
     """World from the LiDAR's frame at the time of the measurement, shape (4, 4), float64; None where unknown."""
     cross_section: np.ndarray | None = None
     """Radar cross section [dBm²], shape (k,), float32; None where unknown."""
+
+
+@message("warploom.CameraSet")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CameraSet:
+    """The latest of each camera."""
+
+    version: int
+    """Of the newest [ns]."""
+    cameras: tuple[CameraObjects, ...]
+
+
+@message("warploom.RadarSet")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RadarSet:
+    """The latest of each radar."""
+
+    version: int
+    """Of the newest [ns]."""
+    radars: tuple[RadarObjects, ...]
 
 
 @message("warploom.PointLabels")

@@ -17,14 +17,26 @@ import numpy as np
 from ..dag import ConfigFile, ModuleSpec, Process, VertexTiming, find_config, load_module, nearest, parse_overrides
 from ..datamesh import CommitPolicy, DataMesh, Entry, Output
 from ..errors import ConfigError, SourceError
-from .messages import Obstacles, PointLabels, SensorFrame
+from .messages import CameraSet, Obstacles, PointLabels, RadarSet, SensorFrame
 from .motion import sweep_motion
 from .profile import CONF, Profile, execution_context, load_profile, profile_device, use_threads
 
-__all__ = ["LIDAR_TOPIC", "OBSTACLES_TOPIC", "POINTS_TOPIC", "Latency", "PerceptionFrame", "Pipeline", "StageLatency"]
+__all__ = [
+    "CAMERAS_TOPIC",
+    "LIDAR_TOPIC",
+    "OBSTACLES_TOPIC",
+    "POINTS_TOPIC",
+    "RADARS_TOPIC",
+    "Latency",
+    "PerceptionFrame",
+    "Pipeline",
+    "StageLatency",
+]
 
 LIDAR_TOPIC = "lidar/points"
 """Where a pipeline commits its source's frames: the modules' input."""
+CAMERAS_TOPIC, RADARS_TOPIC = "camera/objects", "radar/objects"
+"""Where it commits, before a frame, what cameras and radars found since the one before, where the source knows it."""
 OBSTACLES_TOPIC = "perception/obstacles"
 """Where the modules commit the objects of a frame."""
 POINTS_TOPIC = "perception/points"
@@ -198,7 +210,7 @@ class Pipeline:
         return Process(
             self._modules,
             context=self._context,
-            external={LIDAR_TOPIC: SensorFrame},
+            external={LIDAR_TOPIC: SensorFrame, CAMERAS_TOPIC: CameraSet, RADARS_TOPIC: RadarSet},
             offline=offline,
             on_timing=self._record,
             check=self.profile.check,
@@ -340,8 +352,11 @@ class _Run:
         self._process = process
         self._source = source
         self._realtime = realtime
-        self._lidar: Output[SensorFrame] = Output()
-        self._lidar.bind("lidar", process.mesh.window(LIDAR_TOPIC))
+        self._lidar, self._cameras, self._radars = Output(), Output(), Output()
+        for output, topic in (
+            (self._lidar, LIDAR_TOPIC), (self._cameras, CAMERAS_TOPIC), (self._radars, RADARS_TOPIC),
+        ):  # fmt: skip
+            output.bind("lidar", process.mesh.window(topic))
         self._events: queue.Queue[tuple[str, Any]] = queue.Queue()
         # As many frames as the modules let into their graphs at once: a frame that is fed does not wait behind others,
         # so its latency is its own; and a caller who is slow to take frames holds up the source.
@@ -408,14 +423,21 @@ class _Run:
                     if not self._room.acquire(blocking=False):
                         self._process.mesh.losses.count("source", "frames_not_taken", frame.version)
                         continue
-                with self._lidar.allocate_change() as change:
-                    change.set_version(frame.version)
-                    change.value = frame
-                    self._events.put(("frame", frame))
-                    self._lidar.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+                for output, others in ((self._cameras, frame.cameras), (self._radars, frame.radars)):
+                    if others is not None:
+                        self._commit(output, others)
+                self._events.put(("frame", frame))
+                self._commit(self._lidar, frame)
         except BaseException as error:
             failure = error
         self._events.put(("end", failure))
+
+    @staticmethod
+    def _commit(output: Output, value: SensorFrame | CameraSet | RadarSet) -> None:
+        with output.allocate_change() as change:
+            change.set_version(value.version)
+            change.value = value
+            output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
 
     def _assemble(self, parts: dict[str, Any]) -> PerceptionFrame:
         sensor: SensorFrame = parts["sensor"]

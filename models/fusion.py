@@ -48,7 +48,8 @@ class FusionConfig:
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     """Of the objects that the LiDAR sees."""
     sensors: tuple[str, ...] = ()
-    """Names of the cameras and radars there should be: those without recent data are said to be missing."""
+    """Names of the cameras and radars there should be: those without recent data are said to be missing, and so are
+    those that gave data before."""
     max_age: float = 0.3
     """Older data of a camera or radar is not used [s]."""
     camera_overlap: float = 0.35
@@ -172,6 +173,12 @@ class Fusion:
             tuple[str, int], tuple[int, int]
         ] = {}  # id and time last seen, of the tracks of both trackers
         self._last: tuple[int, np.ndarray | None] | None = None
+        self._sensors = dict.fromkeys(self.config.sensors)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the cameras and radars there should be: those of the configuration, and those that gave data."""
+        return tuple(self._sensors)
 
     def update(
         self,
@@ -215,6 +222,7 @@ class Fusion:
         cameras = [each for each in cameras if self._is_recent(ages[each.sensor])]
         radars = [each for each in radars if self._is_recent(ages[each.sensor])]
         used = {each.sensor: ages[each.sensor] for each in (*cameras, *radars)}
+        self._sensors.update(dict.fromkeys(used))
         usable = np.isfinite(boxes).all(1) & np.isfinite(scores) & (boxes[:, 3:6] > 0).all(1)
         safe = np.where(usable[:, None], boxes, 0.0)
 
@@ -350,7 +358,7 @@ class Fusion:
             camera=camera[through],
             radar=radar[through],
             ages=used,
-            missing=tuple(name for name in config.sensors if name not in used),
+            missing=tuple(name for name in self._sensors if name not in used),
         )
 
     def _hand_on(self, version: int, tracks: Tracks, own: Tracks) -> Tracks:

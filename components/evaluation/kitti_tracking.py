@@ -7,6 +7,7 @@ z up, which keeps every overlap what KITTI's own evaluation has.
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -232,14 +233,25 @@ def _read_labels(path: pathlib.Path, kind: ObjectType) -> tuple[np.ndarray, dict
     return table, {frame: np.array(each) for frame, each in areas.items()}
 
 
-def write_results(path: pathlib.Path, sequence: TrackingSequence, kind: ObjectType, tracks: TrackTable) -> None:
-    """Writes tracks as KITTI wants results: frame id type 0 0 alpha, image box, h w l x y z ry, score."""
+def write_results(path: pathlib.Path, *tracks: tuple[TrackingSequence, ObjectType, TrackTable]) -> None:
+    """Writes tracks as KITTI wants results: frame id type 0 0 alpha, image box, h w l x y z ry, score.
+
+    Args:
+        path: The file of one sequence.
+        tracks: Of one type or several, each with its sequence; in the file the frames are in order.
+    """
+    lines = [line for each in tracks for line in _result_lines(*each)]
+    lines.sort(key=lambda line: line[0])  # stable: within a frame as they came
+    path.write_text("".join(text + "\n" for _, text in lines))
+
+
+def _result_lines(sequence: TrackingSequence, kind: ObjectType, tracks: TrackTable) -> Iterator[tuple[int, str]]:
     camera = _camera_boxes(tracks.boxes)
     image = sequence.image_boxes(tracks.boxes)
     scores = np.zeros(len(camera)) if tracks.scores is None else tracks.scores
     alpha = camera[:, 6] - np.arctan2(camera[:, 3], camera[:, 5])
     alpha = np.remainder(alpha + np.pi, 2.0 * np.pi) - np.pi
-    with path.open("w") as file:
-        for k in range(len(camera)):
-            numbers = " ".join(f"{v:.6f}" for v in (alpha[k], *image[k], *camera[k]))
-            file.write(f"{tracks.frames[k]} {tracks.ids[k]} {kind.name} 0 0 {numbers} {scores[k]:.9g}\n")
+    for k in range(len(camera)):
+        frame = int(tracks.frames[k])
+        numbers = " ".join(f"{v:.6f}" for v in (alpha[k], *image[k], *camera[k]))
+        yield frame, f"{frame} {tracks.ids[k]} {kind.name} 0 0 {numbers} {scores[k]:.9g}"

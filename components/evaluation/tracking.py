@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,7 @@ __all__ = [
     "score_tracks",
     "track",
     "track_confidences",
+    "write_summary",
 ]
 
 OVERLAPS = (0.25, 0.5, 0.7)
@@ -51,7 +53,7 @@ class TrackingEvaluation:
     frames_per_second: float
     """Of the tracker alone, over all sequences; NaN where it was not measured."""
     dropped: dict[str, int]
-    """Detections that the tracker left out, by reason."""
+    """Detections that were left out, and frames out of the ordinary such as a `gap`, by reason."""
 
     def as_dict(self) -> dict[str, Any]:
         """What `summary.json` holds: averages and MOTA in percent."""
@@ -59,7 +61,7 @@ class TrackingEvaluation:
             "type": self.kind.name,
             "sequences": list(self.sequences),
             "frames_per_second": self.frames_per_second if self.frames_per_second > 0.0 else None,
-            "detections_dropped": self.dropped,
+            "dropped": self.dropped,
             "hota": {
                 "HOTA": 100 * self.hota.hota,
                 "DetA": 100 * self.hota.detection,
@@ -213,21 +215,28 @@ def evaluate_tracking(
     read = [TrackingSequence.read(data, folder, name, kind, logits=logits) for name in names]
 
     out.mkdir(parents=True, exist_ok=True)
-    tables, seconds, dropped = [], 0.0, {}
+    tables, seconds, dropped = [], 0.0, Counter()
     for sequence in read:
         tracker = Tracker(config)
         table, took = track(sequence, kind, tracker)
-        write_results(out / f"{sequence.name}.txt", sequence, kind, table)
+        write_results(out / f"{sequence.name}.txt", (sequence, kind, table))
         tables.append(table)
         seconds += took
-        for reason, count in tracker.dropped.items():
-            dropped[reason] = dropped.get(reason, 0) + count
+        dropped.update(tracker.dropped + tracker.incidents)
     speed = sum(len(sequence.frames) for sequence in read) / max(seconds, 1e-9)
     truth = [sequence.truth for sequence in read]
     result = score_tracks(kind, names, truth, tables, frames_per_second=speed, dropped=dropped)
     (out / "summary.json").write_text(json.dumps(result.as_dict(), indent=2) + "\n")
     draw_recall(out / "recall.png", result.kind.name, result.averages)
     return result
+
+
+def write_summary(out: pathlib.Path, results: Sequence[TrackingEvaluation]) -> None:
+    """Writes what several types reached: `summary.json` with an entry for each, and a `recall_TYPE.png` for each."""
+    summary = {result.kind.name: result.as_dict() for result in results}
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    for result in results:
+        draw_recall(out / f"recall_{result.kind.name}.png", result.kind.name, result.averages)
 
 
 def _speed(frames_per_second: float) -> str:
@@ -246,5 +255,5 @@ def lines_of(result: TrackingEvaluation) -> list[str]:
         *("  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows),
         f"HOTA {100 * result.hota.hota:.2f}, DetA {100 * result.hota.detection:.2f}, "
         f"AssA {100 * result.hota.association:.2f}, of the tracks with the highest MOTA at 0.5",
-        *(f"{count} detections dropped: {reason}" for reason, count in result.dropped.items() if count),
+        *(f"{count} dropped: {reason}" for reason, count in result.dropped.items() if count),
     ]

@@ -2,7 +2,8 @@
 
 A simulator or a decoder may be slower than the sensor, so frames are made ahead: the first seconds of a drive, which
 are then played to and fro. Each frame follows the one before it by one period of motion, forwards or backwards, so
-that what perceives it sees one continuous drive however long it lasts.
+that what perceives it sees one continuous drive however long it lasts. Where the simulator plays, it plays the cameras
+and radars of the profile too, at the level of objects.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from ...dag import Component, ProcessorConfig
@@ -20,7 +22,8 @@ from ...datamesh import CommitPolicy, Output
 from ...datamesh.clock import Timer
 from ...errors import WarploomError
 from ..execution import ExecutionContext
-from ..messages import SensorFrame
+from ..messages import CameraSet, RadarSet, SensorFrame
+from .transforms import mounting_matrix
 
 __all__ = ["LidarDriver", "LidarDriverConfig"]
 
@@ -59,6 +62,8 @@ class LidarDriver(Component):
     """How long a stop waits for a frame that is being made."""
 
     cloud: Output[SensorFrame]
+    cameras: Output[CameraSet] = Output(optional=True)
+    radars: Output[RadarSet] = Output(optional=True)
 
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context)
@@ -138,7 +143,7 @@ class LidarDriver(Component):
             due = self.clock.monotonic_ns()
             index = 0
             while frame is not None and not self._stopping.is_set():
-                self._commit(replace(frame, version=self.clock.now_ns(), index=index, frame_id=self._config.sensor))
+                self._commit(_stamped(frame, self.clock.now_ns(), index, self._config.sensor))
                 index += 1
                 frame = next(frames, None)
                 if frame is not None:
@@ -158,6 +163,8 @@ class LidarDriver(Component):
 
         context = self.context or ExecutionContext()
         source = open_source(self._uri, device=context.device)
+        if hasattr(source, "suite"):
+            self._equip(source, context)
         if self._config.play == "once":
             yield from source
             return
@@ -172,10 +179,23 @@ class LidarDriver(Component):
         position, step = 0, 1
         while made:
             frame = made[position]
-            yield frame if step > 0 else _backwards(frame)
+            yield frame if step > 0 else _backwards(frame, made[min(position + 1, last)], self._period_ns)
             if not 0 <= position + step <= last:
                 step = -step
             position = min(max(position + step, 0), last)
+
+    def _equip(self, source: Any, context: ExecutionContext) -> None:
+        """Gives a simulated vehicle the cameras and radars of the profile, where it says where they are."""
+        from ..sources.simulated_sensors import mounted_suite
+
+        def mounted(kind: str) -> dict[str, np.ndarray]:
+            specs = {name: context.sensors[name].mounting for name in context.sensor_kinds.get(kind, ())}
+            return {name: mounting_matrix(at.xyz, at.rpy_deg) for name, at in specs.items() if at is not None}
+
+        cameras, radars = mounted("camera"), mounted("radar")
+        lidar = getattr(context.sensors.get(self._config.sensor), "mounting", None)
+        if lidar is not None and (cameras or radars):
+            source.suite = mounted_suite(mounting_matrix(lidar.xyz, lidar.rpy_deg), cameras, radars)
 
     def _wait(self, due: int) -> int:
         """Waits until a sweep is due, by the clock of the mesh; gives when it was, or is now where that is past."""
@@ -194,15 +214,69 @@ class LidarDriver(Component):
         return due
 
     def _commit(self, frame: SensorFrame) -> None:
-        with self.cloud.allocate_change() as change:
-            change.set_version(frame.version)
-            change.value = frame
-            self.cloud.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+        for output, others in ((self.cameras, frame.cameras), (self.radars, frame.radars)):
+            if others is not None and output.is_bound:
+                _commit_to(output, others)
+        _commit_to(self.cloud, replace(frame, cameras=None, radars=None))
         self._committed += 1
 
 
-def _backwards(frame: SensorFrame) -> SensorFrame:
-    """A frame as it is seen while the drive goes backwards: what moves goes the other way."""
-    if frame.truth is None:
-        return frame
-    return replace(frame, truth=replace(frame.truth, velocities=-frame.truth.velocities))
+def _commit_to(output: Output, value: SensorFrame | CameraSet | RadarSet) -> None:
+    with output.allocate_change() as change:
+        change.set_version(value.version)
+        change.value = value
+        output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
+
+
+def _stamped(frame: SensorFrame, version: int, index: int, frame_id: str) -> SensorFrame:
+    """A frame as of another time, and with it what cameras and radars found before."""
+    shift = version - frame.version
+    return replace(
+        frame,
+        version=version,
+        index=index,
+        frame_id=frame_id,
+        cameras=_shifted_cameras(frame.cameras, shift),
+        radars=_shifted_radars(frame.radars, shift),
+    )
+
+
+def _shifted_cameras(given: CameraSet | None, shift: int) -> CameraSet | None:
+    if given is None:
+        return None
+    cameras = tuple(replace(one, version=one.version + shift) for one in given.cameras)
+    return CameraSet(version=given.version + shift, cameras=cameras)
+
+
+def _shifted_radars(given: RadarSet | None, shift: int) -> RadarSet | None:
+    if given is None:
+        return None
+    radars = tuple(replace(one, version=one.version + shift) for one in given.radars)
+    return RadarSet(version=given.version + shift, radars=radars)
+
+
+def _backwards(frame: SensorFrame, before: SensorFrame, period_ns: int) -> SensorFrame:
+    """A frame as it is seen while the drive goes backwards: what moves goes the other way.
+
+    What cameras and radars found in between is what they found before `before`, the sweep that is played before it.
+    """
+    truth, cameras, radars = frame.truth, before.cameras, before.radars
+    if truth is not None:
+        truth = replace(truth, velocities=-truth.velocities)
+    if cameras is not None:
+        age = period_ns - (before.version - cameras.version)
+        cameras = _shifted_cameras(cameras, frame.version - age - cameras.version)
+    if radars is not None:
+        age = period_ns - (before.version - radars.version)
+        radars = _shifted_radars(radars, frame.version - age - radars.version)
+        assert radars is not None
+        turned = tuple(
+            replace(
+                one,
+                radial_velocities=-one.radial_velocities,
+                velocity=None if one.velocity is None else -one.velocity,
+            )
+            for one in radars.radars
+        )
+        radars = replace(radars, radars=turned)
+    return replace(frame, truth=truth, cameras=cameras, radars=radars)

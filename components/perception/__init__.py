@@ -10,7 +10,7 @@ from .fusion import FusionProcessor
 from .ground import GroundProcessor
 from .merging import MergeProcessor
 from .point_labels import PointLabelsProcessor
-from .tracking import TrackingProcessor
+from .tracking import TrackingComponent, TrackingProcessor
 
 __all__ = [
     "BackgroundProcessor",
@@ -23,5 +23,6 @@ __all__ = [
     "GroundProcessor",
     "MergeProcessor",
     "PointLabelsProcessor",
+    "TrackingComponent",
     "TrackingProcessor",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from pydantic import Field
@@ -10,8 +11,9 @@ from pydantic import Field
 from ...dag import In, Out, Processor, Trigger
 from ...datamesh import Status
 from ...models.fusion import Fusion, FusionConfig
-from ..messages import CameraObjects, DetectedObjects, Obstacles, RadarObjects
+from ..messages import CameraObjects, CameraSet, DetectedObjects, Obstacles, RadarObjects, RadarSet
 from .tracker_settings import TrackerSettings
+from .tracking import Troubles
 
 __all__ = ["FusionProcessor", "FusionSettings"]
 
@@ -47,9 +49,9 @@ class FusionSettings(TrackerSettings):
 class FusionProcessor(Processor):
     """Tracks, fuses, and lets through what exists. Belongs in a monotonic component, whose LiDAR frames trigger it.
 
-    `cameras` and `radars` take a message or several in a tuple, the latest before the trigger, as
+    `cameras` and `radars` take a message, a set or several in a tuple, the latest before the trigger, as
     `GetRecentDagProcessor` gives them; without them it works on, and says in `missing_inputs` what there should have
-    been.
+    been. Data that were too old or from the future are counted as losses, by reason, and so is what the tracker counts.
     """
 
     Config = FusionSettings
@@ -61,8 +63,14 @@ class FusionProcessor(Processor):
 
     def init(self, config: FusionSettings) -> None:
         """Starts without objects."""
-        self._fusion = Fusion(config.fusion_config())
+        self._fusion = fusion = Fusion(config.fusion_config())
+        self._troubles = Troubles(
+            fusion.incidents, fusion.tracker.dropped, fusion.tracker.incidents,
+            fusion.radar_tracker.dropped, fusion.radar_tracker.incidents,
+        )  # fmt: skip
         self._epoch: int | None = None
+        self._ages: dict[str, float] = {}
+        self._missing: tuple[str, ...] = fusion.sensors
 
     def process(self, trigger: Trigger) -> Status:
         """Takes up the detections of one frame."""
@@ -71,7 +79,6 @@ class FusionProcessor(Processor):
         if not sensor.continues or trigger.epoch != self._epoch:
             self._fusion.clear()
             self._epoch = trigger.epoch
-        before = sum(self._fusion.incidents.values())
         fused = self._fusion.update(
             sensor.version,
             detections.boxes,
@@ -83,13 +90,21 @@ class FusionProcessor(Processor):
             cameras=_messages(self.cameras, CameraObjects),
             radars=_messages(self.radars, RadarObjects),
         )
-        unused = sum(self._fusion.incidents.values()) - before
-        if unused:
-            self.losses.count(self.place, "stale", trigger.version, unused)
+        self._troubles.tell(self.losses, self.place, trigger.version)
+        self._ages, self._missing = fused.ages, fused.missing
         self.obstacles.value = Obstacles.of_frame(
             detected, fused, rows=fused.lidar, scores=fused.existence, missing=fused.missing
         )
         return Status.OK
+
+    def state(self) -> Mapping[str, str | float | int]:
+        """How many tracks there are, and which sensors joined the LiDAR in the latest frame, how old [ms]."""
+        joined = " ".join(f"{name} {1000 * age:.0f} ms" for name, age in self._ages.items())
+        return {
+            "tracks": len(self._fusion.tracker),
+            "joined": joined or "the LiDAR alone",
+            **({"missing": " ".join(self._missing)} if self._missing else {}),
+        }
 
 
 def _messages(port: In[Any], kind: type) -> tuple[Any, ...]:
@@ -97,6 +112,10 @@ def _messages(port: In[Any], kind: type) -> tuple[Any, ...]:
     if not port.present:
         return ()
     value = port.value
+    if isinstance(value, CameraSet):
+        value = value.cameras
+    elif isinstance(value, RadarSet):
+        value = value.radars
     messages = value if isinstance(value, tuple) else (value,)
     for each in messages:
         if not isinstance(each, kind):

@@ -12,29 +12,40 @@ from .source import Source
 
 if TYPE_CHECKING:
     from ...models.simulator import SimulatedFrame
+    from .simulated_sensors import SensorSuite
 
 __all__ = ["SimulatorSource"]
 
 
 class SimulatorSource(Source):
-    """A simulated drive; the same arguments give the same frames."""
+    """A simulated drive; the same arguments give the same frames.
 
-    def __init__(self, place: str = "street", /, *, device: str | None = None, **options):
+    Its sweeps bring what cameras and radars of the vehicle found a little before: `suite` says which there are.
+    """
+
+    def __init__(self, place: str = "street", /, *, device: str | None = None, sensors: str = "all", **options):
         """Builds the world.
 
         Args:
             place: Which scenario, unless `options` name one.
             device: Where the rays are cast; None: the CPU.
+            sensors: `all`, or `lidar` alone.
             options: Any of scenario, seed, duration [s], rate [Hz], lidar, mounting_height [m], turning, rain [mm/h].
 
         Raises:
             ValueError: There is no such scenario or lidar, or a number makes no sense.
         """
         from ...models.simulator import PointClass, Simulator  # its kernels are compiled only when it is used
+        from .simulated_sensors import SensorSuite
 
+        if sensors not in ("all", "lidar"):
+            raise ValueError(f"sensors must be all or lidar, not {sensors!r}")
+        self.suite: SensorSuite | None = SensorSuite() if sensors == "all" else None
         self._unscored = (PointClass.VEGETATION, PointClass.NOISE)  # as the ground score of SemanticKITTI leaves it out
         said = "&".join(f"{key}={value}" for key, value in options.items())
-        self._simulator = Simulator(device=device or "cpu", **{"scenario": place} | options)
+        self._simulator = Simulator(
+            device=device or "cpu", visibility=sensors == "all", **{"scenario": place} | options
+        )
         super().__init__(f"sim:{place}" + (f"?{said}" if said else ""))
 
     @property
@@ -66,4 +77,6 @@ class SimulatorSource(Source):
                 ground=frame.ground,
                 ground_scored=~np.isin(frame.point_class, self._unscored),
             ),
+            cameras=None if self.suite is None else self.suite.cameras_of(self._simulator, frame),
+            radars=None if self.suite is None else self.suite.radars_of(self._simulator, frame),
         )

@@ -1,5 +1,6 @@
 """A LiDAR simulator: procedural streets, sensor models, ray casting, and ground truth for every point and object."""
 
+from .camera_objects import CameraDetections, CameraDetector
 from .cameras import Camera, CameraFrame
 from .ego_sensors import GnssModel, ImuModel, WheelSpeedModel, local_from_geodetic
 from .frame import SimulatedFrame
@@ -16,6 +17,8 @@ __all__ = [
     "LIDARS",
     "SCENARIOS",
     "Camera",
+    "CameraDetections",
+    "CameraDetector",
     "CameraFrame",
     "GnssModel",
     "ImuModel",

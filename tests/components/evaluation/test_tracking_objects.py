@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from warploom.components.evaluation.tracking_objects import lines_of_drive, score_drive
+from warploom.components.evaluation.tracking_objects import drive_uris, lines_of_drives, score_drives
 from warploom.components.messages import Obstacles, SensorFrame, Truth
-from warploom.errors import SourceError
+from warploom.errors import ConfigError, SourceError
 from warploom.models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from warploom.models.geometry import invert, rigid, transform_boxes
 from warploom.models.tracker import Tracker
@@ -51,7 +51,7 @@ def drive(ids_after, error=0.3):
 
 
 def test_an_id_that_is_kept_and_one_that_is_not():
-    kept, lost = score_drive("kept", drive(1)), score_drive("lost", drive(2))
+    kept, lost = score_drives("kept", [drive(1)]), score_drives("lost", [drive(2)])
     assert (kept.occlusions, kept.kept) == (1, 1)
     assert (lost.occlusions, lost.kept) == (1, 0)
     assert kept.summary.recall == kept.summary.precision == 1.0
@@ -59,10 +59,10 @@ def test_an_id_that_is_kept_and_one_that_is_not():
 
 
 def test_velocities_count_once_a_track_is_a_second_old():
-    result = score_drive("drive", drive(1))
+    result = score_drives("drive", [drive(1)])
     assert result.settled_velocity_error == pytest.approx(0.3, abs=1e-5)
     assert result.settled == 5 + 15  # 10 to 14, and all after
-    assert "0.30 m/s" in "\n".join(lines_of_drive(result))
+    assert "0.30 m/s" in "\n".join(lines_of_drives(result))
 
 
 def test_an_object_that_is_seen_and_not_found_is_not_occluded():
@@ -73,15 +73,51 @@ def test_an_object_that_is_seen_and_not_found_is_not_occluded():
             found = not 15 <= k < 25
             yield sensor, objects(sensor, box if found else [], [1] if found else [], [[10, 0]] if found else [])
 
-    result = score_drive("missed", missed())
+    result = score_drives("missed", [missed()])
     assert result.occlusions == 0
     assert result.summary.recall == 0.75
+
+
+def test_several_drives_are_one_score_and_their_ids_are_their_own():
+    both = score_drives("both", [drive(1), drive(2)])
+    assert (both.drives, both.occlusions, both.kept) == (2, 2, 1)
+    assert both.settled == 20 + 10  # of the second drive: 10 to 14, and 35 to 39
+    assert both.summary.objects == 60
+    assert "50 %" in "\n".join(lines_of_drives(both))
+
+
+@pytest.mark.parametrize(
+    ("first_visible", "again", "cases", "kept"),
+    [(15, 25, 1, 1), (15, 27, 1, 1), (15, 36, 1, 0), (12, 19, 1, 1), (15, 19, 0, 0), (15, 39, 0, 0)],
+    ids=["found at once", "found a little later", "not found again", "0.8 s", "too short", "not seen for long enough"],
+)
+def test_what_counts_as_an_occlusion(first_visible, again, cases, kept):
+    """Hidden from a frame to 25 (or 19, or the 38th) by the truth; found again from a frame on."""
+    back = {19: 19, 39: 38}.get(again, 25)
+
+    def life():
+        for k in range(40):
+            hidden = first_visible <= k < back
+            box = [[10 + k, 2, 0, 4.4, 1.9, 1.6, 0]]
+            sensor = frame(k, truth_of(box, [VEHICLE], [7], [[10, 0]], [0 if hidden else 50]))
+            found = not hidden and (k < first_visible or k >= again)
+            yield sensor, objects(sensor, box if found else [], [1] if found else [], [[10, 0]] if found else [])
+
+    result = score_drives("life", [life()])
+    assert (result.occlusions, result.kept) == (cases, kept)
+
+
+def test_seeds_stand_for_several_drives():
+    assert drive_uris("sim:street?seed=3") == ["sim:street?seed=3"]
+    assert drive_uris("sim:street?seeds=3-5&duration=2") == [f"sim:street?seed={k}&duration=2" for k in (3, 4, 5)]
+    with pytest.raises(ConfigError, match="holds no seed"):
+        drive_uris("sim:street?seeds=5-3")
 
 
 def test_frames_without_truth_are_refused():
     sensor = frame(0, None)
     with pytest.raises(SourceError, match="without truth"):
-        score_drive("drive", [(sensor, objects(sensor, [], [], []))])
+        score_drives("drive", [[(sensor, objects(sensor, [], [], []))]])
 
 
 def tracked(seed, classes, speeds):
@@ -113,7 +149,7 @@ def test_velocities_and_ids_through_a_second_of_occlusion():
     for seed in range(8):
         classes = np.resize([VEHICLE, PEDESTRIAN, CYCLIST, VEHICLE], 12)
         speeds = np.where(classes == VEHICLE, 9.0, np.where(classes == CYCLIST, 5.0, 1.3))
-        result = score_drive("scene", tracked(seed, classes, speeds))
+        result = score_drives("scene", [tracked(seed, classes, speeds)])
         kept, occlusions = kept + result.kept, occlusions + result.occlusions
         errors.append(result.settled_velocity_error)
     assert occlusions > 60

@@ -1,5 +1,6 @@
 """The driver commits sweeps at the sensor's rate by the clock of the mesh, to and fro, and says when it cannot."""
 
+import dataclasses
 import threading
 import time
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from warploom.components.execution import ExecutionContext
-from warploom.components.messages import SensorFrame, Truth
+from warploom.components.messages import CameraObjects, CameraSet, RadarObjects, RadarSet, SensorFrame, Truth
 from warploom.components.node.lidar import LidarDriver, LidarDriverConfig
 from warploom.components.profile import MountingSpec, SensorSpec
 from warploom.datamesh import DataMesh
@@ -47,10 +48,11 @@ class Driven:
         self.clock = clock
         self.mesh = DataMesh(clock=clock)
         self.driver = LidarDriver("driver", ExecutionContext())
-        self.driver.bind(self.mesh, {"cloud": "raw"})
+        self.driver.bind(self.mesh, {"cloud": "raw", "cameras": "cameras", "radars": "radars"})
         self.driver.init(LidarDriverConfig.model_validate({"sensor": "roof", **config}))
-        self.came = []
-        self.mesh.window("raw").subscribe(self.came.append, lambda *_: None)
+        self.came, self.cameras, self.radars = [], [], []
+        for topic, came in (("raw", self.came), ("cameras", self.cameras), ("radars", self.radars)):
+            self.mesh.window(topic).subscribe(came.append, lambda *_: None)
         self.driver.start()
 
     def waits(self):
@@ -98,6 +100,42 @@ def test_the_drive_goes_to_and_fro_and_backwards_everything_moves_backwards(driv
     assert [int(entry.value.points[0, 0]) for entry in driven.came] == [0, 1, 2, 1, 0, 1, 2, 1, 0]
     speeds = [float(entry.value.truth.velocities[0, 0]) for entry in driven.came]
     assert speeds == [3, 3, 3, -3, -3, 3, 3, -3, -3]
+
+
+def with_others(count):
+    """As `frames`, after a camera 50 ms before each and a radar 30 ms before, whose only target goes away at 5 m/s."""
+    for frame in frames(count):
+        k = np.array([[frame.index]], np.float32)
+        camera = CameraObjects(
+            version=frame.version - 50_000_000, sensor="camera", boxes=np.tile(k, 4), scores=k[0],
+            projection=np.eye(4)[:3], classes=np.zeros(1, np.int32), size=(10, 10),
+        )  # fmt: skip
+        radar = RadarObjects(
+            version=frame.version - 30_000_000, sensor="radar", positions=np.tile(k, 3), scores=k[0],
+            mounting=np.eye(4), radial_velocities=np.full(1, 5, np.float32), velocity=np.array([8.0, 0, 0]),
+        )  # fmt: skip
+        yield dataclasses.replace(
+            frame, cameras=CameraSet(version=camera.version, cameras=(camera,)),
+            radars=RadarSet(version=radar.version, radars=(radar,)),
+        )  # fmt: skip
+
+
+def test_cameras_and_radars_are_played_with_the_sweeps_and_backwards_too(drive):
+    driven = drive(with_others(9), ahead_s=0.3)
+    driven.periods(4)
+    sweeps = [entry.version for entry in driven.came]
+    assert [int(entry.value.points[0, 0]) for entry in driven.came] == [0, 1, 2, 1, 0]
+    assert all(entry.value.cameras is None for entry in driven.came)
+    cameras, radars = ([entry.value for entry in came] for came in (driven.cameras, driven.radars))
+    # Between the sweeps 2 and 1 lies what was found before sweep 2, at its place in time.
+    assert [int(one.cameras[0].boxes[0, 0]) for one in cameras] == [0, 1, 2, 2, 1]
+    assert [sweep - one.version for sweep, one in zip(sweeps, cameras, strict=True)] == [50_000_000] * 5
+    assert [sweep - one.version for sweep, one in zip(sweeps, radars, strict=True)] == [30_000_000] * 3 + [
+        70_000_000
+    ] * 2
+    assert [one.radars[0].version for one in radars] == [one.version for one in radars]
+    assert [float(one.radars[0].radial_velocities[0]) for one in radars] == [5, 5, 5, -5, -5]
+    assert [float(one.radars[0].velocity[0]) for one in radars] == [8, 8, 8, -8, -8]
 
 
 def test_a_single_frame_stands_still(drive):
@@ -170,7 +208,7 @@ def test_a_source_that_takes_for_ever_to_open_does_not_hold_up_the_stop(monkeypa
     monkeypatch.setattr(LidarDriver, "stop_timeout_s", 0.01)
     mesh = DataMesh()
     driver = LidarDriver("driver", ExecutionContext())
-    driver.bind(mesh, {"cloud": "raw"})
+    driver.bind(mesh, {"cloud": "raw", "cameras": "cameras", "radars": "radars"})
     driver.init(LidarDriverConfig(sensor="roof"))
     driver.start()
     assert opening.wait(10)
@@ -204,7 +242,7 @@ def test_the_simulator_plays_a_sensor():
     """In earnest, with few lasers: a cloud of the named sensor comes out."""
     mesh = DataMesh()
     driver = LidarDriver("driver", ExecutionContext())
-    driver.bind(mesh, {"cloud": "raw"})
+    driver.bind(mesh, {"cloud": "raw", "cameras": "cameras", "radars": "radars"})
     driver.init(LidarDriverConfig(sensor="roof", model="vlp16", ahead_s=0.1))
     came = threading.Event()
     mesh.window("raw").subscribe(lambda entry: came.set(), lambda *_: None)
