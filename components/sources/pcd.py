@@ -1,7 +1,6 @@
 """PCD files: point clouds of the Point Cloud Library, as text, binary or compressed binary.
 
-Source: the PCD file format, version 0.7, https://pointclouds.org/documentation/tutorials/pcd_file_format.html;
-the compression is Marc Lehmann's LibLZF.
+Source: the PCD file format, version 0.7, https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ import io
 import numpy as np
 
 from ...errors import SourceError
+from ..lzf import lzf_decompress
 from .scan import Scan, scan_from_columns
 
-__all__ = ["decode_pcd", "lzf_decompress"]
+__all__ = ["decode_pcd", "decode_pcd_columns"]
 
 _MAX_HEADER = 65536
 _KEYS = ("VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -31,6 +31,25 @@ def decode_pcd(data: bytes, where: object) -> Scan:
 
     Raises:
         SourceError: The header is not that of a PCD file, or there are fewer points than it says.
+    """
+    columns, _, kind = decode_pcd_columns(data, where)
+    plain = {name: column for name, column in columns.items() if column.ndim == 1}
+    return scan_from_columns(plain, format=f"PCD, {kind}", where=where)
+
+
+def decode_pcd_columns(data: bytes, where: object) -> tuple[dict[str, np.ndarray], int, str]:
+    """Decodes all fields of a PCD file but padding: the columns, how many rows the points lie in, and the kind of file.
+
+    Args:
+        data: The whole file.
+        where: The file, for errors.
+
+    Returns:
+        Columns of shape (n,) or (n, count) in the types of the file, by name; rows, 1 where the points have no order;
+        ascii, binary or binary_compressed.
+
+    Raises:
+        SourceError: As of `decode_pcd`.
     """
     header, body = _header(data, where)
     names, layout = _layout(header, where)
@@ -50,8 +69,10 @@ def decode_pcd(data: bytes, where: object) -> Scan:
         columns = _compressed(body, layout, points, where)
     else:
         raise SourceError(f"{where}: DATA is {kind!r}; known are ascii, binary and binary_compressed")
-    named = {name: columns[key] for key, name in names.items() if columns[key].ndim == 1}
-    return scan_from_columns(named, format=f"PCD, {kind}", where=where)
+    rows = _integers(header, "HEIGHT", where)[0] if "HEIGHT" in header else 1
+    ordered = rows > 1 and "WIDTH" in header and _integers(header, "WIDTH", where)[0] * rows == points
+    named = {name: columns[key] for key, name in names.items() if name != "_"}
+    return named, rows if ordered else 1, kind
 
 
 def _header(data: bytes, where: object) -> tuple[dict[str, list[str]], memoryview]:
@@ -140,7 +161,8 @@ def _ascii(body: memoryview, layout: np.dtype, points: int, where: object) -> di
             limits = np.iinfo(base)
             if not (np.isfinite(column).all() and column.min() >= limits.min and column.max() < float(limits.max) + 1):
                 raise SourceError(f"{where}: a number does not fit the type {base} of its field")
-        columns[name] = column.astype(base) if base.kind in "iu" else column
+        with np.errstate(over="ignore"):
+            columns[name] = column.astype(base)
     return columns
 
 
@@ -167,57 +189,3 @@ def _compressed(body: memoryview, layout: np.dtype, points: int, where: object) 
         columns[name] = column.reshape(points, *part.shape)
         start += points * part.itemsize
     return columns
-
-
-def lzf_decompress(data: bytes, size: int) -> bytes:
-    """Unpacks LZF data.
-
-    A control byte below 32 is followed by that many bytes and one more, taken as they are; any other is a copy of what
-    was unpacked before: its upper three bits are the length less two (seven: one more byte is added), its lower five
-    bits and the next byte the distance back less one.
-
-    Args:
-        data: The packed bytes.
-        size: How many bytes they make.
-
-    Raises:
-        ValueError: They are damaged, or do not make that many bytes.
-    """
-    # The longest copy makes 264 bytes of three: more than that in all is a lie, told before memory is taken for it.
-    if size > 88 * len(data):
-        raise ValueError(f"damaged: {len(data)} compressed bytes cannot make {size}")
-    out = bytearray(size)
-    position = made = 0
-    end = len(data)
-    try:
-        while position < end:
-            control = data[position]
-            position += 1
-            if control < 32:
-                length = control + 1
-                if position + length > end or made + length > size:
-                    raise IndexError
-                out[made : made + length] = data[position : position + length]
-                position += length
-            else:
-                length = control >> 5
-                if length == 7:
-                    length += data[position]
-                    position += 1
-                length += 2
-                begin = made - ((control & 31) << 8) - data[position] - 1
-                position += 1
-                if begin < 0 or made + length > size:
-                    raise IndexError
-                distance = made - begin
-                if distance >= length:
-                    out[made : made + length] = out[begin : begin + length]
-                else:  # the copy runs into itself: a pattern that repeats
-                    pattern = out[begin:made]
-                    out[made : made + length] = (pattern * (length // distance + 1))[:length]
-            made += length
-    except IndexError:
-        raise ValueError(f"damaged compressed data near byte {position}") from None
-    if made != size:
-        raise ValueError(f"damaged: the compressed data makes {made} bytes, not {size}")
-    return bytes(out)

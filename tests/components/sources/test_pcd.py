@@ -1,4 +1,3 @@
-import contextlib
 import struct
 
 import numpy as np
@@ -6,64 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warploom.components.lzf import lzf_compress
 from warploom.components.sources import read, read_scan
-from warploom.components.sources.pcd import decode_pcd, lzf_decompress
+from warploom.components.sources.pcd import decode_pcd
 from warploom.errors import SourceError
 
 
 def header(data, fields="x y z", size="4 4 4", kinds="F F F", points=2, extra=""):
     text = f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kinds}\n{extra}"
     return f"{text}WIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n".encode()
-
-
-def lzf_compress(data):
-    """A small packer for tests: literals, and copies of what repeats."""
-    out, literal, seen, position = bytearray(), bytearray(), {}, 0
-
-    def flush():
-        for start in range(0, len(literal), 32):
-            part = literal[start : start + 32]
-            out.extend([len(part) - 1, *part])
-        literal.clear()
-
-    while position < len(data):
-        key = bytes(data[position : position + 3])
-        at = seen.get(key)
-        seen[key] = position
-        if len(key) == 3 and at is not None and position - at <= 8192:
-            length = 3
-            while position + length < len(data) and length < 264 and data[at + length] == data[position + length]:
-                length += 1
-            flush()
-            back = position - at - 1
-            if length - 2 < 7:
-                out.extend([(length - 2) << 5 | back >> 8, back & 255])
-            else:
-                out.extend([7 << 5 | back >> 8, length - 9, back & 255])
-            position += length
-        else:
-            literal.append(data[position])
-            position += 1
-    flush()
-    return bytes(out)
-
-
-@given(st.lists(st.sampled_from([b"abc", b"\0" * 40, b"x", bytes(range(256)), b"ab" * 300]), max_size=30).map(b"".join))
-@settings(max_examples=60, deadline=None)
-def test_lzf_unpacks_what_was_packed(data):
-    assert lzf_decompress(lzf_compress(data), len(data)) == data
-
-
-@given(st.binary(max_size=60), st.integers(0, 3000))
-@settings(max_examples=200, deadline=None)
-def test_damaged_lzf_is_refused_or_has_the_size_said(data, size):
-    with contextlib.suppress(ValueError):
-        assert len(lzf_decompress(data, size)) == size
-
-
-def test_lzf_that_claims_gigabytes_is_refused_before_memory_is_taken():
-    with pytest.raises(ValueError, match="cannot make"):
-        lzf_decompress(b"\xff" * 100, 1 << 40)
 
 
 @pytest.mark.parametrize(("ascii", "compressed"), [(True, False), (False, False), (False, True)])
