@@ -33,34 +33,29 @@ def check_covariance(covariance: tuple[float, ...], size: int, name: str = "cova
         raise ValueError(f"{name} must have {size * size} values, {size} × {size} row by row, not {len(covariance)}")
 
 
-@message("geometry_msgs.Point32")
 @dataclass(frozen=True)
-class Point32:
-    """A point, which other systems keep in single precision [m]."""
-
+class _Components:
     x: float = 0.0
     y: float = 0.0
     z: float = 0.0
+
+
+@message("geometry_msgs.Point32")
+@dataclass(frozen=True)
+class Point32(_Components):
+    """A point, which other systems keep in single precision [m]."""
 
 
 @message("geometry_msgs.Point")
 @dataclass(frozen=True)
-class Point:
+class Point(_Components):
     """A point [m]."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
 
 
 @message("geometry_msgs.Vector3")
 @dataclass(frozen=True)
-class Vector3:
+class Vector3(_Components):
     """A direction with a length: it is turned with its frame, and not moved with it."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
 
 
 @message("geometry_msgs.Quaternion")
