@@ -254,8 +254,8 @@ class SupervisedProcess:
                     life.hung = f"did not stop within {life.patience_s:g} s"
                     self._kill_hanging(life)
                     killing, due = True, now + 0.2
-                elif self.state is State.RUNNING and (silent := now - life.heard) < (self.spec.health_timeout_s or 0):
-                    due = now + (self.spec.health_timeout_s or 0) - silent
+                elif self.state is State.RUNNING and (rest := self._still_patient(life, now, due or now)) > 0:
+                    due = now + rest
                 else:
                     limit = self.spec.health_timeout_s if self.state is State.RUNNING else self.spec.start_timeout_s
                     what = "gave no sign of life" if self.state is State.RUNNING else "was not ready"
@@ -285,6 +285,15 @@ class SupervisedProcess:
                     life.hung = f"hangs: {', '.join(hanging)}"
                     self._kill_hanging(life)
                     killing, due = True, now + _TERM_GRACE_S
+
+    def _still_patient(self, life: _Life, now: float, due: float) -> float:
+        """How long to wait on for a sign of life [s]; 0: no more."""
+        timeout = self.spec.health_timeout_s or 0.0
+        silent = now - life.heard
+        if silent < timeout:
+            return timeout - silent
+        # Where this process did not come to run itself, the machine is busy: nobody can be said to hang.
+        return timeout / 4 if now - due > timeout / 10 else 0.0
 
     @staticmethod
     async def _next_mail(life: _Life, due: float | None) -> tuple[str, Any]:

@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 
 import psutil
@@ -140,6 +141,21 @@ def test_what_says_that_a_part_hangs_is_ended(watched):
     one = watched(nothing, "hangs", exception_handler="ignore")
     assert one.process.deaths == {"hung": 1}
     assert one.process.last_death.startswith("hangs: part.process at version 7 for 9.0 s; was ended by ")
+
+
+def test_on_a_machine_so_busy_that_the_supervisor_is_late_itself_nobody_hangs(watched):
+    async def scenario(process):
+        await process.wait_for(State.RUNNING)
+        await asyncio.sleep(0.3)  # as long as it comes to run, its signs of life arrive
+        os.kill(process.pid, signal.SIGSTOP)
+        time.sleep(2.0)  # neither of them comes to run
+        os.kill(process.pid, signal.SIGCONT)
+        await asyncio.sleep(1.5)
+        process.ask_to_stop()
+
+    one = watched(scenario, "beats", health_timeout_s=1.0)
+    assert one.process.deaths == {}
+    assert not one.find("hangs")
 
 
 def test_what_is_silent_gets_sigterm_then_sigkill(watched):

@@ -58,6 +58,15 @@ for order in orders():
             sys.exit(1)
         say("running")
         say("beat", hanging=["part.process at version 7 for 9.0 s"] if behaviour == "hangs" else [])
+        if behaviour == "beats":
+            import threading
+
+            def beat():
+                while True:
+                    time.sleep(0.02)
+                    say("beat", hanging=[])
+
+            threading.Thread(target=beat, daemon=True).start()
         if behaviour == "silent":
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if behaviour == "ends":
