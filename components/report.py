@@ -47,7 +47,7 @@ class RunReport:
         """Takes up one frame."""
         self.frames += 1
         self.failed += frame.failed
-        self._points.append(len(frame.points))
+        self._points.append(len(frame.sensor.points))
         self._dropped.update(frame.dropped)
         if not frame.failed:
             self._total_ms.append(frame.latency.total_ms)
