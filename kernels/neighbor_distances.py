@@ -16,7 +16,7 @@ from .device import DEFAULT_DEVICE
 from .point_tree import LEAF, PointTree, next_node
 from .threads import launch_parts, thread_count
 
-__all__ = ["NeighborDistances", "parts_for"]
+__all__ = ["Eight", "NeighborDistances", "lay_out", "parts_for"]
 
 # How far a point is must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -29,7 +29,8 @@ _WINDOW = wp.constant(3)  # leaves on either side of one that tell how far neigh
 _LARGEST = wp.constant(3.0e38)
 _FARTHEST = wp.constant(wp.float64(3.0e38))
 
-_Eight = wp.types.vector(length=int(LEAF), dtype=wp.float32)
+Eight = wp.types.vector(length=int(LEAF), dtype=wp.float32)
+"""One coordinate of the points of a leaf."""
 
 
 def parts_for(points: int, most: int) -> int:
@@ -38,20 +39,20 @@ def parts_for(points: int, most: int) -> int:
 
 
 @wp.kernel
-def _lay_out(
+def lay_out(
     # in
     points_in: wp.array(dtype=wp.vec3),
     size_in: wp.array(dtype=wp.int32),
     # out
-    x_out: wp.array(dtype=_Eight),
-    y_out: wp.array(dtype=_Eight),
-    z_out: wp.array(dtype=_Eight),
+    x_out: wp.array(dtype=Eight),
+    y_out: wp.array(dtype=Eight),
+    z_out: wp.array(dtype=Eight),
 ):
     """Coordinates of a leaf side by side, for vector instructions; where it has no point, infinitely far."""
     leaf = wp.tid()
-    x = _Eight(wp.inf)
-    y = _Eight(wp.inf)
-    z = _Eight(wp.inf)
+    x = Eight(wp.inf)
+    y = Eight(wp.inf)
+    z = Eight(wp.inf)
     for k in range(LEAF):
         i = leaf * LEAF + k
         if i < size_in[0]:
@@ -91,9 +92,9 @@ class _Lists:
 """)
 def _append(
     p: wp.vec3,
-    x: _Eight,
-    y: _Eight,
-    z: _Eight,
+    x: Eight,
+    y: Eight,
+    z: Eight,
     reach: float,
     nearest: wp.array(dtype=wp.float32),
     first: int,
@@ -145,15 +146,15 @@ def _append(
 """)
 def _visit(
     members: int,
-    own_x: _Eight,
-    own_y: _Eight,
-    own_z: _Eight,
+    own_x: Eight,
+    own_y: Eight,
+    own_z: Eight,
     is_own: bool,
     low: wp.vec3,
     high: wp.vec3,
-    x: _Eight,
-    y: _Eight,
-    z: _Eight,
+    x: Eight,
+    y: Eight,
+    z: Eight,
     nearest: wp.array(dtype=wp.float32),
     first: int,
     pitch: int,
@@ -261,9 +262,9 @@ def _mean_distances_of(
     leaf: int,
     size: int,
     points: wp.array(dtype=wp.vec3),
-    x: wp.array(dtype=_Eight),
-    y: wp.array(dtype=_Eight),
-    z: wp.array(dtype=_Eight),
+    x: wp.array(dtype=Eight),
+    y: wp.array(dtype=Eight),
+    z: wp.array(dtype=Eight),
     low: wp.array(dtype=wp.vec3),
     high: wp.array(dtype=wp.vec3),
     leaves: int,
@@ -348,9 +349,9 @@ def _mean_distances_of(
 def _mean_distances(
     # in
     points_in: wp.array(dtype=wp.vec3),
-    x_in: wp.array(dtype=_Eight),
-    y_in: wp.array(dtype=_Eight),
-    z_in: wp.array(dtype=_Eight),
+    x_in: wp.array(dtype=Eight),
+    y_in: wp.array(dtype=Eight),
+    z_in: wp.array(dtype=Eight),
     size_in: wp.array(dtype=wp.int32),
     low_in: wp.array(dtype=wp.vec3),
     high_in: wp.array(dtype=wp.vec3),
@@ -381,9 +382,9 @@ def _mean_distances_in_parts(
     parts: int,
     # in
     points_in: wp.array(dtype=wp.vec3),
-    x_in: wp.array(dtype=_Eight),
-    y_in: wp.array(dtype=_Eight),
-    z_in: wp.array(dtype=_Eight),
+    x_in: wp.array(dtype=Eight),
+    y_in: wp.array(dtype=Eight),
+    z_in: wp.array(dtype=Eight),
     size_in: wp.array(dtype=wp.int32),
     low_in: wp.array(dtype=wp.vec3),
     high_in: wp.array(dtype=wp.vec3),
@@ -451,7 +452,7 @@ class NeighborDistances:
         keep("_nearest", wp.zeros(lists.room * held, dtype=wp.float32, device=device))
         keep("_filled", wp.zeros(slots, dtype=wp.int32, device=device))
         keep("_within", wp.zeros(slots, dtype=wp.float32, device=device))
-        keep("_eights", [wp.zeros(tree.leaves, dtype=_Eight, device=device) for _ in range(3)])
+        keep("_eights", [wp.zeros(tree.leaves, dtype=Eight, device=device) for _ in range(3)])
         keep("mean", wp.zeros(self.capacity, dtype=wp.float32, device=device))
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
@@ -463,7 +464,7 @@ class NeighborDistances:
         """
         tree = self.tree
         tree.build(xyz, count)
-        wp.launch(_lay_out, tree.leaves, inputs=[tree.points, tree.size], outputs=self._eights, device=self.mean.device)
+        wp.launch(lay_out, tree.leaves, inputs=[tree.points, tree.size], outputs=self._eights, device=self.mean.device)
         inputs = [tree.points, *self._eights, tree.size, tree.low, tree.high, tree.leaves, self.neighbors, self._lists]
         outputs = [self._nearest, self._filled, self._within, self.mean]
         if self.mean.device.is_cpu:

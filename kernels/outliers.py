@@ -15,7 +15,8 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 from .interop import borrow_points, count_on, give
-from .neighbor_distances import NeighborDistances, parts_for
+from .neighbor_distances import Eight, NeighborDistances, lay_out, parts_for
+from .outlier_parts import Reach, find_lonely_in_parts
 from .plan import capacity_for, plan_for
 from .point_tree import LEAF, PointTree, gap_squared, next_node
 from .threads import launch_parts, thread_count
@@ -25,7 +26,7 @@ __all__ = ["RadiusOutliers", "StatisticalOutliers", "radius_outliers", "statisti
 # Which points are within a radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_RUN = wp.constant(256)  # points that one thread sums, or a part looks at before it leaves as many to the others
+_RUN = wp.constant(256)  # points that one thread sums
 
 
 @wp.func
@@ -39,15 +40,8 @@ def _distance_squared(p: wp.vec3, q: wp.vec3) -> float:
 # ---- by radius
 
 
-@wp.struct
-class _Reach:
-    surely: wp.float32  # squared distances in float32 up to here are within the radius whatever the rounding
-    surely_not: wp.float32  # and above here they are not
-    squared: wp.float64
-
-
 @wp.func
-def _is_near(p: wp.vec3, q: wp.vec3, reach: _Reach) -> bool:
+def _is_near(p: wp.vec3, q: wp.vec3, reach: Reach) -> bool:
     """Whether the distance is within the radius, as float64 decides; float32 does where it is sure to agree."""
     squared = _distance_squared(p, q)
     near = squared <= reach.surely
@@ -61,7 +55,7 @@ def _is_near(p: wp.vec3, q: wp.vec3, reach: _Reach) -> bool:
 
 @wp.func
 def _count_in_leaf(
-    points: wp.array(dtype=wp.vec3), leaf: int, size: int, i: int, p: wp.vec3, reach: _Reach, enough: int
+    points: wp.array(dtype=wp.vec3), leaf: int, size: int, i: int, p: wp.vec3, reach: Reach, enough: int
 ) -> int:
     """How many others of a leaf are near; not more than enough."""
     found = int(0)
@@ -79,7 +73,7 @@ def _is_lonely(
     low: wp.array(dtype=wp.vec3),
     high: wp.array(dtype=wp.vec3),
     leaves: int,
-    reach: _Reach,
+    reach: Reach,
     min_neighbors: int,
 ) -> bool:
     """Counts a point's neighbours until there are enough, from its own leaf on upwards."""
@@ -110,7 +104,7 @@ def _find_lonely(
     low_in: wp.array(dtype=wp.vec3),
     high_in: wp.array(dtype=wp.vec3),
     leaves: int,
-    reach: _Reach,
+    reach: Reach,
     min_neighbors: int,
     # out: true
     outlier_out: wp.array(dtype=wp.bool),
@@ -120,30 +114,6 @@ def _find_lonely(
     if i < size_in[0]:
         lonely = _is_lonely(i, size_in[0], points_in, low_in, high_in, leaves, reach, min_neighbors)
         outlier_out[index_in[i]] = lonely
-
-
-@wp.kernel
-def _find_lonely_in_parts(
-    part: int,
-    parts: int,
-    # in
-    points_in: wp.array(dtype=wp.vec3),
-    index_in: wp.array(dtype=wp.int32),
-    size_in: wp.array(dtype=wp.int32),
-    low_in: wp.array(dtype=wp.vec3),
-    high_in: wp.array(dtype=wp.vec3),
-    leaves: int,
-    reach: _Reach,
-    min_neighbors: int,
-    # out: true
-    outlier_out: wp.array(dtype=wp.bool),
-):
-    """Every so many runs of points, so that crowded places are shared out."""
-    size = size_in[0]
-    for run in range(part, (size + _RUN - 1) // _RUN, parts):
-        for i in range(run * _RUN, wp.min((run + 1) * _RUN, size)):
-            lonely = _is_lonely(i, size, points_in, low_in, high_in, leaves, reach, min_neighbors)
-            outlier_out[index_in[i]] = lonely
 
 
 # ---- by statistics
@@ -229,11 +199,14 @@ class RadiusOutliers:
             raise ValueError(f"min_neighbors must be at least 1, not {self.min_neighbors}")
         tree = PointTree(capacity=self.capacity, device=self.device)
         squared = self.radius * self.radius
-        reach = _Reach()
+        reach = Reach()
         reach.squared, reach.surely, reach.surely_not = squared, squared * (1 - 1e-6), squared * (1 + 1e-6)
         object.__setattr__(self, "_tree", tree)
         object.__setattr__(self, "_reach", reach)
         object.__setattr__(self, "_parts", thread_count())
+        device = tree.points.device
+        eights = [wp.zeros(tree.leaves, dtype=Eight, device=device) for _ in range(3 if device.is_cpu else 0)]
+        object.__setattr__(self, "_eights", eights)
         object.__setattr__(self, "outlier", wp.full(self.capacity, True, dtype=wp.bool, device=tree.points.device))
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
@@ -246,10 +219,13 @@ class RadiusOutliers:
         tree = self._tree
         tree.build(xyz, count)
         self.outlier.fill_(True)
-        inputs = [tree.points, tree.index, tree.size, tree.low, tree.high, tree.leaves, self._reach, self.min_neighbors]
+        given = [tree.low, tree.high, tree.leaves, self._reach, self.min_neighbors]
         if self.outlier.device.is_cpu:
-            launch_parts(_find_lonely_in_parts, parts_for(xyz.shape[0], self._parts), inputs, [self.outlier])
+            wp.launch(lay_out, tree.leaves, inputs=[tree.points, tree.size], outputs=self._eights, device=self.device)
+            inputs = [tree.index, tree.size, *self._eights, *given]
+            launch_parts(find_lonely_in_parts, parts_for(xyz.shape[0], self._parts), inputs, [self.outlier])
         else:
+            inputs = [tree.points, tree.index, tree.size, *given]
             wp.launch(_find_lonely, xyz.shape[0], inputs=inputs, outputs=[self.outlier], device=self.device)
 
 

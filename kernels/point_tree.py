@@ -25,6 +25,7 @@ LEAF = wp.constant(8)
 
 _CHUNK = wp.constant(256)
 _AXIS_BITS = 16
+_SORTED_BITS = 32  # the highest of the key: as many as a CPU sorts in two passes; what is finer stays as it came
 _LAST_CELL = wp.constant(65535.0)
 _NOWHERE = wp.constant(wp.int64(1 << 48))  # behind all points: no point, or one that is not finite
 _HIGHEST = 2**31 - 1
@@ -168,6 +169,20 @@ def _bound_nodes(
     high[node] = wp.max(high[2 * node], high[2 * node + 1])
 
 
+@wp.kernel
+def _bound_all_nodes(
+    leaves: int,
+    # in out
+    low: wp.array(dtype=wp.vec3),
+    high: wp.array(dtype=wp.vec3),
+):
+    """All levels by one thread, children before their parents."""
+    for k in range(1, leaves):
+        node = leaves - k
+        low[node] = wp.min(low[2 * node], low[2 * node + 1])
+        high[node] = wp.max(high[2 * node], high[2 * node + 1])
+
+
 @wp.func
 def gap_squared(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> float:
     """The squared distance of a point to a box; never more than float32 says of any point in it."""
@@ -246,13 +261,17 @@ class PointTree:
         run(_reset, 1, [], [self._bounds, self.size])
         run(_bound_points, -(-n // _CHUNK), [xyz, count], [self._bounds, self.size])
         run(_key_points, self.capacity, [xyz, count, self._bounds], [self._keys, self._indices])
-        wp.utils.radix_sort_pairs(self._keys, self._indices, self.capacity, begin_bit=0, end_bit=3 * _AXIS_BITS + 1)
+        end = 3 * _AXIS_BITS + 1
+        wp.utils.radix_sort_pairs(self._keys, self._indices, self.capacity, begin_bit=end - _SORTED_BITS, end_bit=end)
         run(
             _bound_leaves,
             self.leaves,
             [xyz, self.index, self.size, self.leaves],
             [self.points, self.low, self.high],
         )
+        if self.size.device.is_cpu:
+            run(_bound_all_nodes, 1, [self.leaves], [self.low, self.high])
+            return
         first = self.leaves // 2
         while first:
             run(_bound_nodes, first, [first], [self.low, self.high])
