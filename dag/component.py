@@ -69,7 +69,18 @@ class Component:
         """What the flag loaders of the process found."""
 
     def bind(self, mesh: DataMesh, topics: Mapping[str, str]) -> None:
-        """Connects the handles to their topics in the mesh."""
+        """Connects the handles to their topics in the mesh.
+
+        Args:
+            mesh: Where the topics are.
+            topics: Their names by handle.
+
+        Raises:
+            ValueError: A handle has no topic.
+        """
+        missing = [name for name in (*self.inputs, *self.outputs) if name not in topics]
+        if missing:
+            raise ValueError(f"{self.name}: {missing[0]!r} has no topic; topics are given for: {', '.join(topics)}")
         self.losses = mesh.losses
         self.clock = mesh.clock
         for name, handle in (*self.inputs.items(), *self.outputs.items()):
@@ -166,8 +177,16 @@ class DataProcessComponent(Component):
             backlog: What happens when they come faster than it runs; triggers of time wait by their `overrun`.
             hand_off: thread: it runs in a thread of its own; inline: in the thread that commits, which for that long
                 does not come back from its commit.
+
+        Raises:
+            ValueError: The component has no such input, or there is no such hand-off.
         """
         config = TriggerConfig.model_validate(trigger)
+        unknown = [name for name in config.inputs if name not in self.inputs]
+        if unknown:
+            raise ValueError(f"{self.name} has no input {unknown[0]!r}; it has: {', '.join(self.inputs) or 'none'}")
+        if hand_off not in ("thread", "inline"):
+            raise ValueError(f"hand_off must be thread or inline, not {hand_off!r}")
         self._inline = hand_off == "inline"
         self.trigger_inputs = config.inputs
         if config.period_ms is not None:

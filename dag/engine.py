@@ -119,8 +119,10 @@ class GraphEngine:
             on_timing: Is told of every vertex's run, in the worker's thread.
 
         Raises:
-            ValueError: There is no vertex.
+            ValueError: There is no vertex, or no worker.
         """
+        if workers < 1:
+            raise ValueError(f"workers must be >= 1, not {workers}: nobody would run the graph of {name!r}")
         if not vertices:
             raise ValueError(f"the graph of {name!r} has no vertices: nothing would ever finish a frame")
         self.name = name

@@ -228,7 +228,12 @@ class ProcessorHarness:
             context: What the runtime would give as `self.context`.
             inputs: The component's inputs, bound, for a processor that reads the mesh.
             outputs: The component's outputs, bound, for a processor that commits to the mesh.
+
+        Raises:
+            TypeError: It is no class of a processor.
         """
+        if not (isinstance(processor, type) and issubclass(processor, Processor)):
+            raise TypeError(f"ProcessorHarness takes the class of a processor, not {processor!r}")
         self.processor = processor()
         self.processor.context = context
         self.processor.component_inputs = inputs or {}
@@ -257,6 +262,9 @@ class ProcessorHarness:
 
         Args:
             version: Of the frame [ns], or the whole trigger.
+
+        Raises:
+            TypeError: `process` returned no Status.
         """
         outputs = {name: port for name, port in self.processor.ports.items() if isinstance(port, Out)}
         for port in outputs.values():
@@ -267,4 +275,6 @@ class ProcessorHarness:
             if self.processor.begin(trigger, resumed.set):
                 resumed.wait()
         self.status = self.processor.process(trigger)
+        if not isinstance(self.status, Status):
+            raise TypeError(f"process of {type(self.processor).__name__} returned {self.status!r}, not a Status")
         return {name: port.value for name, port in outputs.items() if port.present}

@@ -90,7 +90,10 @@ class Change(Generic[T]):
             TypeError: The version is not a whole number.
             ValueError: The version is negative or does not fit in 64 bits.
         """
-        version = operator.index(version)
+        try:
+            version = operator.index(version)
+        except TypeError:
+            raise TypeError(f"version must be a whole number of nanoseconds, not {version!r}") from None
         if not 0 <= version < 1 << 64:
             raise ValueError(f"version must be an unsigned 64-bit number of nanoseconds, not {version}")
         self._version = version
@@ -334,9 +337,16 @@ class Output(_Handle[T]):
 
         Raises:
             RuntimeError: It was committed or abandoned already.
-            ValueError: It has no version or no value; or `equal` is ERROR, and there is one of its version.
+            TypeError: There is no such policy, or what is to be committed is no change.
+            ValueError: It has no version or no value, or is another output's; or `equal` is ERROR, and there is one of
+                its version.
         """
-        window, version, value = change._window, change._version, change._value
+        try:
+            window, version, value = change._window, change._version, change._value
+        except AttributeError:
+            raise TypeError(f"commit takes a policy and a change of `allocate_change`, not {change!r}") from None
+        if window is not self._window:
+            raise ValueError(f"the change is of {window.topic!r}: it cannot be committed to {self.topic!r}")
         if change._closed:
             raise RuntimeError(
                 f"this change of {window.topic!r} was committed or abandoned already; a change is committed once"

@@ -23,7 +23,12 @@ class DataMesh:
             clock: By which data are stamped, waits end and time triggers come; by default the machine's.
             check: Payloads are compared with what they were at their commit, when they are released and when they are
                 evicted; what was written to since is counted as `modified`. For tests: it reads every byte.
+
+        Raises:
+            ValueError: `window_capacity` is below 1.
         """
+        if window_capacity < 1:
+            raise ValueError(f"window_capacity must be >= 1, not {window_capacity}")
         self.losses = LossCounters()
         self.clock = clock if clock is not None else SystemClock()
         self.check = check

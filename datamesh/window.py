@@ -165,13 +165,16 @@ class Window(Generic[T]):
             OK (also for what is held back to be put in order), OUT_OF_ORDER, DUPLICATE or REJECTED, which are counted.
 
         Raises:
+            TypeError: `policy` or `equal` is none.
             ValueError: There is one of its version, and `equal` is ERROR.
         """
         with self._commit_lock:
-            if isinstance(policy, Reorder):
+            if isinstance(policy, CommitPolicy):
+                status = self._publish(policy, entry, equal, triggers)
+            elif isinstance(policy, Reorder):
                 status = self._hold(policy, entry, equal, triggers)
             else:
-                status = self._publish(policy, entry, equal, triggers)
+                raise TypeError(f"policy must be a CommitPolicy or a Reorder, not {policy!r}")
         for after in self._after:
             after()
         return status
@@ -241,6 +244,8 @@ class Window(Generic[T]):
             return Status.OK, state, len(versions), entry, ()
         index = bisect_left(versions, entry.version)
         if versions[index] == entry.version:
+            if not isinstance(equal, EqualVersion):
+                raise TypeError(f"equal must be an EqualVersion, not {equal!r}")
             if equal is not EqualVersion.REPLACE:
                 return Status.DUPLICATE, state, index, entry, ()
             lost = (("replaced", entry.version),)

@@ -4,7 +4,7 @@ import pytest
 from component_parts import BLOCK, Holding, dag, doubler, failing_at, same
 from graph_parts import Doubler
 
-from warploom.dag import DagComponent, GenericComponent, MonotonicDagComponent, Trigger
+from warploom.dag import BacklogConfig, DagComponent, GenericComponent, MonotonicDagComponent, Trigger
 from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, Miss, Status
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
@@ -240,3 +240,16 @@ def test_a_plain_class_becomes_a_component():
 def test_a_data_process_must_say_what_it_does():
     with pytest.raises(NotImplementedError):
         super(Doubler, Doubler("d")).process(Trigger(1))
+
+
+def test_what_does_not_fit_the_component_is_refused_by_name():
+    mesh = DataMesh()
+    component = Doubler("doubler")
+    with pytest.raises(ValueError, match="doubler: 'double' has no topic; topics are given for: number"):
+        component.bind(mesh, {"number": "number"})
+    component.bind(mesh, {"number": "number", "double": "double"})
+    for trigger in ("numbr", {"all": ["number", "numbr"]}):
+        with pytest.raises(ValueError, match="doubler has no input 'numbr'; it has: number"):
+            component.set_trigger(trigger, BacklogConfig())
+    with pytest.raises(ValueError, match="hand_off must be thread or inline, not 'direct'"):
+        component.set_trigger("number", BacklogConfig(), "direct")

@@ -461,3 +461,8 @@ def test_whoever_serves_the_graph_runs_it_without_a_worker():
 def test_a_graph_of_nothing_is_refused():
     with pytest.raises(ValueError, match="the graph of 'graph' has no vertices"):
         GraphEngine("graph", [], 1)
+
+
+def test_a_graph_without_workers_is_refused():
+    with pytest.raises(ValueError, match="workers must be >= 1, not 0: nobody would run the graph of 'graph'"):
+        GraphEngine("graph", [Vertex("vertex", Processor(), {}, {})], 0)

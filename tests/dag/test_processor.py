@@ -94,3 +94,15 @@ def test_the_harness_validates_the_configuration():
 def test_a_processor_must_be_given_something_to_do():
     with pytest.raises(NotImplementedError):
         ProcessorHarness(Processor).run()
+
+
+def test_the_harness_takes_a_class_and_wants_a_status():
+    with pytest.raises(TypeError, match="takes the class of a processor, not"):
+        ProcessorHarness(Processor())
+
+    class Forgets(Processor):
+        def process(self, trigger):
+            pass
+
+    with pytest.raises(TypeError, match="process of Forgets returned None, not a Status"):
+        ProcessorHarness(Forgets).run()

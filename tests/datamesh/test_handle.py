@@ -345,3 +345,37 @@ def test_two_components_of_a_class_do_not_share_handles():
     assert a.lidar is not b.lidar
     assert a.inputs == {"lidar": a.lidar}
     assert a.outputs == {"hdmap": a.hdmap}
+
+
+def test_a_change_goes_to_its_own_output_alone():
+    mesh = DataMesh()
+    one, other = Output(), Output()
+    one.bind("one", mesh.window("left"))
+    other.bind("other", mesh.window("right"))
+    change = other.allocate_change()
+    change.set_version(1)
+    change.value = 1
+    with pytest.raises(ValueError, match="the change is of 'right': it cannot be committed to 'left'"):
+        one.commit(DISCARD, change)
+    assert other.commit(DISCARD, change) is Status.OK
+    with pytest.raises(TypeError, match="commit takes a policy and a change"):
+        one.commit(one.allocate_change(), DISCARD)  # the wrong way round
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "said"),
+    [
+        ("discard", {}, "policy must be a CommitPolicy or a Reorder, not 'discard'"),
+        (None, {}, "policy must be"),
+        (DISCARD, {"equal": "replace"}, "equal must be an EqualVersion, not 'replace'"),
+    ],
+)
+def test_a_policy_that_is_none_is_refused_and_publishes_nothing(policy, options, said):
+    output = bound(Output)
+    publish(output, 5, "first")
+    change = output.allocate_change()
+    change.set_version(5)
+    change.value = "second"
+    with pytest.raises(TypeError, match=said):
+        output.commit(policy, change, **options)
+    assert output.window.snapshot().last() == "first"

@@ -46,3 +46,8 @@ def test_threads_that_ask_at_once_get_the_same_window():
         thread.join(10)
     assert len(got) == 8
     assert len(set(map(id, got))) == 1
+
+
+def test_windows_without_room_are_refused_when_the_mesh_is_made():
+    with pytest.raises(ValueError, match="window_capacity must be >= 1, not 0"):
+        DataMesh(0)
