@@ -6,6 +6,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warploom.kernels import point_tree
 from warploom.kernels.point_tree import LEAF, PointTree
 
 
@@ -48,6 +49,20 @@ def test_neighbours_in_the_order_are_neighbours_in_space():
     tree = build(points)
     extent = (tree.high.numpy() - tree.low.numpy())[tree.leaves :]
     assert np.median(extent.prod(axis=1)) * tree.leaves < 1.0
+
+
+def test_level_by_level_bounds_the_same_nodes():
+    """As on a GPU; on a CPU one thread bounds them all."""
+    tree = build(np.random.default_rng(2).normal(0, 5, (777, 3)).astype(np.float32))
+    low, high = wp.clone(tree.low), wp.clone(tree.high)
+    for corners in (low, high):
+        corners[: tree.leaves].zero_()
+    first = tree.leaves // 2
+    while first:
+        wp.launch(point_tree._bound_nodes, first, inputs=[first], outputs=[low, high], device="cpu")
+        first //= 2
+    assert np.array_equal(low.numpy()[1:], tree.low.numpy()[1:])
+    assert np.array_equal(high.numpy()[1:], tree.high.numpy()[1:])
 
 
 def test_duplicates_and_a_plan_used_again(device):

@@ -5,11 +5,23 @@ an array must not matter. What the numbers should be is told by the tests of eac
 """
 
 import dataclasses
+import importlib
+import inspect
+import pkgutil
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warploom as wl
+import warploom.kernels
+from warploom.kernels.anchor_decode import AnchorDecode
+from warploom.kernels.gather import gather_rows
+from warploom.kernels.ground import elevation_grid
+from warploom.kernels.interop import borrow
+from warploom.kernels.nms import rotated_nms
+from warploom.kernels.pillar import pillar_channels, pillarize
+from warploom.kernels.raycast import raycast
 
 RANGE = (-20.0, -20.0, -4.0, 20.0, 20.0, 4.0)
 CAMERA_FROM_LIDAR = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0.0], [0, 0, 0, 1]])
@@ -85,6 +97,46 @@ def perspective(table):
     return wl.inverse_perspective(like(table, pixels), INTRINSICS, camera, (2, -10, 22, 10), (20, 30))
 
 
+def suppress(table):
+    return rotated_nms(like(table, boxes_of(table)), like(table, table)[:, 3], 0.3)
+
+
+def gather(table):
+    """The intensities of the rows that a column of the table names, in the order of another."""
+    n = len(table)
+    values, owner = borrow(table[:, 3], wp.float32, (n,), "values")
+    rows = wp.array(labels_of(n) * 3, dtype=wp.int32, device="cpu")
+    out = wp.zeros(n, dtype=wp.float32, device="cpu")
+    gather_rows(values, rows, wp.array([n], dtype=wp.int32, device="cpu"), out)
+    del owner
+    return out.numpy()
+
+
+def decode_anchors(table):
+    """The table as what a network says of sixteen anchors, as often as there is room."""
+    maps = np.zeros(11 * 16, np.float32)
+    flat = table.astype(np.float32).ravel()[: 11 * 16]
+    maps[: len(flat)] = flat
+    scores, residuals, directions = (
+        wp.array(part.reshape(1, -1, 4, 4), dtype=wp.float32, device="cpu") for part in np.split(maps, [32, 144])
+    )
+    plan = AnchorDecode(
+        anchors=((4.0, 1.8, 1.5, -1.0, 0.0),), classes=2, shape=(4, 4), first=(0.0, 0.0), step=(1.0, 1.0), capacity=8
+    )
+    plan.launch(scores, residuals, directions, 0.3, 1.8)
+    assert 0 <= plan.count.numpy()[0] <= 8
+    found = plan.count.numpy()[0]
+    return {"scores": plan.scores.numpy()[:found], "classes": plan.classes_found.numpy()[:found]}
+
+
+def cast_rays(table):
+    """Rays from the table's points, downwards, to two triangles."""
+    corners = np.array([[-30, -30, -3], [30, -30, -3], [30, 30, -3], [-30, 30, -3]], table.dtype)
+    down = np.tile(np.array([0.1, 0, -1], table.dtype), (len(table), 1))
+    hits = raycast(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), table[:, :3], like(table, down))
+    return {"face": hits.face}
+
+
 # By function: how it is called with a table of points x y z intensity, and the shapes of its results for n rows; None
 # stands for any length.
 CASES = {
@@ -99,6 +151,10 @@ CASES = {
     "dynamic_voxelize": (
         lambda p: wl.dynamic_voxelize(p, 0.5, RANGE),
         {"voxel_of_point": ("n",), "coords": (None, 3), "counts": (None,), "means": (None, 4)},
+    ),
+    "elevation_grid": (
+        lambda p: elevation_grid(p, grid_range=(-20, -20, 20, 20), cell_size=2, sensor_height=1.8),
+        {"": (20, 20)},
     ),
     "filter_points": (
         lambda p: wl.filter_points(p, point_range=RANGE, ego_box=(-1, -1, -1, 1, 1, 1)),
@@ -127,6 +183,14 @@ CASES = {
         lambda p: wl.project_points(p, CAMERA_FROM_LIDAR, INTRINSICS, (80, 60), occlusion_cell=4),
         {"pixels": ("n", 2), "depth": ("n",), "visible": ("n",)},
     ),
+    "AnchorDecode": (decode_anchors, {"scores": (None,), "classes": (None,)}),
+    "gather_rows": (gather, {"": ("n",)}),
+    "pillarize": (
+        lambda p: pillarize(p, sensor_height=1.8, point_range=RANGE, cell=0.5),
+        {"": (len(pillar_channels()), 80, 80)},
+    ),
+    "raycast": (cast_rays, {"face": ("n",)}),
+    "rotated_nms": (suppress, {"": (None,)}),
     "radius_outliers": (lambda p: wl.radius_outliers(p, 0.8), {"": ("n",)}),
     "range_image": (lambda p: wl.range_image(p, (16, 64)), {"channels": (None, 16, 64), "index": (16, 64)}),
     "register": (lambda p: wl.register(p, p[: len(p) // 2 + 1]), {"transform": (4, 4)}),
@@ -226,9 +290,21 @@ LAYOUTS = {
 }
 
 
+def takes_arrays(function):
+    """Whether a function takes arrays of any family: then it borrows them."""
+    return inspect.isfunction(function) and "borrow" in inspect.getsource(function)
+
+
 def test_every_kernel_function_is_here():
+    """The functions of the API, and those of any module of kernels that take arrays of any family."""
     functions = {name for home, names in wl._HOMES.items() if home.startswith("kernels.") for name in names}
     functions = {name for name in functions if name[0].islower()}
+    for found in pkgutil.iter_modules(warploom.kernels.__path__):
+        if found.ispkg or found.name in ("camera", "interop"):  # they only hand the arrays on
+            continue
+        module = importlib.import_module(f"warploom.kernels.{found.name}")
+        functions |= {name for name in module.__all__ if takes_arrays(getattr(module, name))}
+    assert {"bev", "pillarize", "rotated_nms"} <= functions
     assert functions <= {name.partition(" ")[0] for name in CASES}
 
 
