@@ -105,3 +105,25 @@ def eval_tracking(
     for line in lines:
         typer.echo(line)
     typer.echo(f"outputs in {out}/")
+
+
+@evaluation.command("fusion")
+def eval_fusion(
+    data: Annotated[
+        str, typer.Option("--data", help="Drives that know the truth, cameras and radars: sim:street?seeds=1-4.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for summary.json.")] = Path("warploom-eval"),
+    profile: Annotated[str, typer.Option("--profile", help="The profile whose pipeline runs.")] = "cpu",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of the profile's modules.")
+    ] = None,
+) -> None:
+    """What cameras and radars add to the LiDAR: recall by distance, velocities from birth on, existence, classes.
+
+    Example: `warploom eval fusion --data "sim:street?seeds=1-4&duration=6" --out fusion`
+    """
+    from ..components.evaluation.fusion import evaluate_fusion, lines_of_gains
+
+    for line in lines_of_gains(evaluate_fusion(data, out, profile=profile, settings=settings or ())):
+        typer.echo(line)
+    typer.echo(f"outputs in {out}/")

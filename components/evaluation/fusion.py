@@ -1,36 +1,41 @@
-"""What fusion gains over the LiDAR alone, on scenes made up for it: traffic out to 140 m, where the LiDAR sees little.
+"""`warploom eval fusion`: what cameras and radars add to the LiDAR, on drives of which all is known.
 
-Cars come and go along a straight road on which the ego vehicle drives. The LiDAR's detector finds near ones surely and
-misses more of them the farther they are, with lower scores, and finds false ones of low score as well; the camera knows
-no distance, but finds cars as far as they have pixels, at a third of the LiDAR's rate of misses; the radar sees their
-radial speed. All three err at random, apart from each other: the gains are what fusion can make of that, not what it
-does in a real street.
+A pipeline finds the objects in the sweeps once; then its detections are fused with no other sensor, with the cameras,
+with the radars and with both, and each is compared with the truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+import pathlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from ...models.classes import VEHICLE
-from ...models.fusion import FusedObjects, Fusion, FusionConfig
-from ...models.geometry import box_corners, invert, rigid, transform_boxes
-from ..messages import CameraObjects, RadarObjects
+from ...errors import SourceError
+from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
+from ...models.detections import Detections
+from ...models.fusion import FusedObjects, Fusion
+from ..messages import SensorFrame
+from ..pipeline import Pipeline
+from .tracking_objects import drive_uris
 
-__all__ = ["SENSOR_SETS", "FusionScore", "fusion_gains", "lines_of_gains", "scene"]
+__all__ = ["RANGES", "SENSOR_SETS", "FusionScore", "evaluate_fusion", "fusion_gains", "lines_of_gains"]
 
-SENSOR_SETS = ((), ("camera",), ("radar",), ("camera", "radar"))
+SENSOR_SETS = ((), ("cameras",), ("radars",), ("cameras", "radars"))
 """What joins the LiDAR."""
+RANGES = ((0.0, 30.0), (30.0, 50.0), (50.0, 70.0), (70.0, 100.0))
+"""Distances from the LiDAR for which recall is told [m]."""
 
-_PERIOD_NS = 100_000_000
-_FAR = 70.0  # [m]
+_DETECTED = "perception/detected"
+_COUNTED = (VEHICLE, PEDESTRIAN, CYCLIST)
 _NEAR_ENOUGH = 3.0  # from the truth [m]
 _BIRTH_FRAMES = 3
-_IMAGE = (1280, 720)
-_OPTICAL = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
-_PROJECTION = np.array([[1100.0, 0, 640], [0, 1100, 360], [0, 0, 1]]) @ _OPTICAL
+_MOVING = 2.0  # [m/s]
+
+Frame = tuple[SensorFrame, Detections]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,180 +44,184 @@ class FusionScore:
 
     sensors: tuple[str, ...]
     """Besides the LiDAR."""
-    recall: float
-    """Of true cars in frames, within 70 m."""
-    far_recall: float
-    """Beyond 70 m."""
+    recall: tuple[float, ...]
+    """For each of `RANGES`, of the road users on which there is a LiDAR point at all; NaN without any."""
+    objects: tuple[int, ...]
+    """How many these are, over all frames."""
     precision: float
-    """Of objects reported in frames, how many are true."""
+    """Of known objects reported within the last range, how many are within 3 m of a true one."""
+    existence_error: float
+    """Mean square of the difference between the probability of existence and whether there is something (Brier)."""
     birth_velocity_error: float
-    """Median length of the difference of velocities in the first three frames of an object [m/s]."""
+    """Median length of the difference of velocities in the first three frames of an object that moves [m/s]."""
     velocity_error: float
     """In all frames [m/s]."""
+    right_class: float
+    """Of the true objects that were found, how many have their class."""
     id_switches: int
-    """How often a true car goes on under another id."""
+    """How often a true object goes on under another id."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it."""
+        values = {key: value if value == value else None for key, value in asdict(self).items()}
+        ranges = [f"{low:g} to {high:g} m" for low, high in RANGES]
+        values["recall"] = {name: r if r == r else None for name, r in zip(ranges, self.recall, strict=True)}
+        values["objects"] = dict(zip(ranges, self.objects, strict=True))
+        return values
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SceneFrame:
-    """One frame of a scene: what the sensors found, and what there is."""
-
-    version: int
-    pose: np.ndarray
-    boxes: np.ndarray
-    scores: np.ndarray
-    camera: CameraObjects
-    radar: RadarObjects
-    truth: np.ndarray
-    """Boxes in the LiDAR's frame, shape (k, 7)."""
-    ids: np.ndarray
-    velocities: np.ndarray
-    """Over ground along the LiDAR's axes, shape (k, 2)."""
-
-
-def scene(seed: int, frames: int = 120, cars: int = 14) -> list[SceneFrame]:
-    """The frames of a scene, ten a second; camera and radar are 50 and 30 ms older than the LiDAR."""
-    random = np.random.default_rng([seed, 23])
-    lane = random.choice([-3.5, 0.0, 3.5, 7.0], cars)
-    speed = np.where(lane > 1.0, -1.0, 1.0) * random.uniform(6, 16, cars)
-    start = np.stack([random.uniform(-20, 220, cars), lane + random.normal(0, 0.2, cars)], axis=1)
-    yaw = np.where(speed > 0, 0.0, np.pi)
-    return [_frame(random, k, start, speed, yaw) for k in range(frames)]
-
-
-def _frame(random: np.random.Generator, k: int, start: np.ndarray, speed: np.ndarray, yaw: np.ndarray) -> SceneFrame:
-    now = 0.1 * k
-
-    def seen(time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes of all cars and the pose at a time."""
-        pose = rigid((8.0 * time, 0.0, 1.7))
-        world = np.zeros((len(start), 7))
-        world[:, 0], world[:, 1], world[:, 2] = start[:, 0] + speed * time, start[:, 1], 0.8
-        world[:, 3:6], world[:, 6] = (4.4, 1.9, 1.6), yaw
-        return transform_boxes(world, invert(pose)), pose
-
-    truth, pose = seen(now)
-    away = np.linalg.norm(truth[:, :2], axis=1)
-    there = (away < 140.0) & (truth[:, 0] > 5.0)
-    chance = np.clip(1.15 - away / 110.0, 0.12, 0.98)
-    found = there & (random.random(len(truth)) < chance)
-    boxes = truth[found] + random.normal(0, 1, (found.sum(), 7)) * [0.12, 0.12, 0.05, 0.2, 0.1, 0.1, 0.06]
-    scores = np.clip(chance[found] * random.uniform(0.55, 1.1, found.sum()), 0.05, 0.99)
-    false = random.poisson(1.5)
-    places = random.uniform([10, -20], [140, 20], (false, 2))
-    shape = np.tile([-0.9, 4.2, 1.8, 1.6, 0.0], (false, 1))
-    boxes = np.concatenate([boxes, np.concatenate([places, shape], axis=1)])
-    scores = np.concatenate([scores, random.uniform(0.1, 0.4, false)])
-
-    then, camera_pose = seen(now - 0.05)
-    uvw = box_corners(then) @ _PROJECTION[:, :3].T + _PROJECTION[:, 3]
-    uv = uvw[..., :2] / np.maximum(uvw[..., 2:], 0.1)
-    image = np.clip(np.concatenate([uv.min(1), uv.max(1)], axis=1), 0, [*_IMAGE, *_IMAGE])
-    tall = image[:, 3] - image[:, 1]
-    visible = there & (tall > 6) & (random.random(len(truth)) < 1.0 - (1.0 - chance) / 3.0)
-    camera = CameraObjects(
-        version=round((now - 0.05) * 1e9) + 10**9,
-        sensor="camera",
-        boxes=(image[visible] + random.normal(0, 1.0, (visible.sum(), 4))).astype(np.float32),
-        scores=random.uniform(0.5, 0.95, visible.sum()).astype(np.float32),
-        classes=np.full(visible.sum(), VEHICLE, np.int32),
-        projection=_PROJECTION,
-        size=_IMAGE,
-        pose=camera_pose,
-    )
-    then, radar_pose = seen(now - 0.03)
-    echo = there & (random.random(len(truth)) < 0.85)
-    points = then[echo, :3] + random.normal(0, 0.4, (echo.sum(), 3)) * [1, 1, 0]
-    velocity = np.stack([speed[echo] - 8.0, np.zeros(echo.sum()), np.zeros(echo.sum())], axis=1)
-    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    clutter = random.poisson(1.0)
-    ghosts = random.uniform([5, -40, 0], [140, 40, 0.01], (clutter, 3))
-    radar = RadarObjects(
-        version=round((now - 0.03) * 1e9) + 10**9,
-        sensor="radar",
-        positions=np.concatenate([points, ghosts]).astype(np.float32),
-        radial_velocities=np.concatenate(
-            [(velocity * rays).sum(1) + random.normal(0, 0.1, echo.sum()), random.uniform(-20, 5, clutter)]
-        ).astype(np.float32),
-        scores=np.full(echo.sum() + clutter, 0.8, np.float32),
-        mounting=np.eye(4),
-        velocity=np.array([8.0, 0.0, 0.0]),
-        pose=radar_pose,
-    )
-    return SceneFrame(
-        version=k * _PERIOD_NS + 10**9,
-        pose=pose,
-        boxes=boxes,
-        scores=scores,
-        camera=camera,
-        radar=radar,
-        truth=truth[there],
-        ids=np.flatnonzero(there),
-        velocities=np.stack([speed, np.zeros_like(speed)], axis=1)[there],
-    )
-
-
-def _found(frame: SceneFrame, objects: FusedObjects) -> np.ndarray:
-    """The row of the object of each true car, −1 for none: nearest pairs first."""
-    match = np.full(len(frame.truth), -1)
-    apart = np.linalg.norm(frame.truth[:, None, :2] - objects.boxes[None, :, :2], axis=2)
+def _found(truth: np.ndarray, objects: FusedObjects) -> np.ndarray:
+    """The row of the object of each true one, −1 for none: nearest pairs first."""
+    match = np.full(len(truth), -1)
+    apart = np.linalg.norm(truth[:, None, :2] - objects.boxes[None, :, :2], axis=2)
+    apart[:, objects.background] = np.inf
     while apart.size and apart.min() < _NEAR_ENOUGH:
-        car, row = np.unravel_index(apart.argmin(), apart.shape)
-        match[car] = row
-        apart[car], apart[:, row] = np.inf, np.inf
+        who, row = np.unravel_index(apart.argmin(), apart.shape)
+        match[who] = row
+        apart[who], apart[:, row] = np.inf, np.inf
     return match
 
 
-def _score(sensors: tuple[str, ...], seeds: Sequence[int]) -> FusionScore:
-    hit, total, reported, switches = np.zeros(2), np.zeros(2), 0, 0
-    errors, births = [], []
-    for seed in seeds:
-        fusion = Fusion(FusionConfig(sensors=sensors))
+class _Tally:
+    """Adds up the frames of one set of sensors."""
+
+    def __init__(self, sensors: tuple[str, ...]):
+        self.sensors = sensors
+        self.hit, self.total = np.zeros(len(RANGES), int), np.zeros(len(RANGES), int)
+        self.reported = self.right = self.classed = self.found = self.switches = 0
+        self.brier: list[float] = []
+        self.errors: list[float] = []
+        self.births: list[float] = []
+
+    def add_drive(self, frames: Iterable[Frame]) -> None:
+        """Fuses one drive, from its beginning."""
+        fusion = Fusion()
         named: dict[int, int] = {}
         lived: dict[int, int] = {}
-        for frame in scene(seed):
+        for sensor, found in frames:
+            cameras = sensor.cameras.cameras if "cameras" in self.sensors and sensor.cameras is not None else ()
+            radars = sensor.radars.radars if "radars" in self.sensors and sensor.radars is not None else ()
             objects = fusion.update(
-                frame.version, frame.boxes, frame.scores, np.full(len(frame.boxes), VEHICLE), pose=frame.pose,
-                cameras=[frame.camera] if "camera" in sensors else [],
-                radars=[frame.radar] if "radar" in sensors else [],
+                sensor.version, found.boxes, found.scores, found.classes, background=found.background,
+                velocities=found.velocities, pose=sensor.pose, cameras=cameras, radars=radars,
             )  # fmt: skip
-            match = _found(frame, objects)
-            far = (np.linalg.norm(frame.truth[:, :2], axis=1) > _FAR).astype(int)
-            total += np.bincount(far, minlength=2)
-            hit += np.bincount(far[match >= 0], minlength=2)
-            reported += len(objects)
-            for car in np.flatnonzero(match >= 0):
-                number, who = int(objects.ids[match[car]]), int(frame.ids[car])
-                switches += named.get(who, number) != number
-                named[who] = number
-                lived[number] = lived.get(number, 0) + 1
-                error = float(np.linalg.norm(objects.velocities[match[car]] - frame.velocities[car]))
-                errors.append(error)
-                if lived[number] <= _BIRTH_FRAMES:
-                    births.append(error)
-    return FusionScore(
-        sensors=sensors,
-        recall=hit[0] / total[0],
-        far_recall=hit[1] / total[1],
-        precision=hit.sum() / max(reported, 1),
-        birth_velocity_error=float(np.median(births)),
-        velocity_error=float(np.median(errors)),
-        id_switches=switches,
-    )
+            self._add(sensor, objects, named, lived)
+
+    def _add(self, sensor: SensorFrame, objects: FusedObjects, named: dict[int, int], lived: dict[int, int]) -> None:
+        truth = sensor.truth
+        if truth is None:
+            raise SourceError(f"frame {sensor.index} comes without truth, which an evaluation needs")
+        known = np.isin(truth.classes, _COUNTED)
+        boxes, ids, velocities = truth.boxes[known].astype(float), truth.ids[known], truth.velocities[known]
+        away = np.linalg.norm(boxes[:, :2], axis=1)
+        counts = truth.points[known] > 0
+        match = _found(boxes, objects)
+        edges = [low for low, _ in RANGES] + [RANGES[-1][1]]
+        self.total += np.histogram(away[counts], edges)[0]
+        self.hit += np.histogram(away[counts & (match >= 0)], edges)[0]
+        reach = ~objects.background & (np.linalg.norm(objects.boxes[:, :2], axis=1) < RANGES[-1][1])
+        true = np.zeros(len(objects), bool)
+        true[match[match >= 0]] = True
+        self.reported += int(reach.sum())
+        self.right += int((reach & true).sum())
+        self.brier += ((objects.existence - true)[reach] ** 2).tolist()
+        for number in objects.ids.tolist():
+            lived[number] = lived.get(number, 0) + 1
+        for who in np.flatnonzero(match >= 0):
+            row, its = match[who], int(ids[who])
+            number = int(objects.ids[row])
+            self.switches += named.get(its, number) != number
+            named[its] = number
+            self.found += 1
+            self.classed += int(objects.classes[row] == truth.classes[known][who])
+            error = float(np.linalg.norm(objects.velocities[row] - velocities[who]))
+            self.errors.append(error)
+            if lived[number] <= _BIRTH_FRAMES and np.linalg.norm(velocities[who]) >= _MOVING:
+                self.births.append(error)
+
+    def score(self) -> FusionScore:
+        """What came of all drives."""
+        with np.errstate(invalid="ignore"):
+            recall = self.hit / self.total
+        return FusionScore(
+            sensors=self.sensors,
+            recall=tuple(recall.tolist()),
+            objects=tuple(self.total.tolist()),
+            precision=self.right / max(self.reported, 1),
+            existence_error=_mean(self.brier),
+            birth_velocity_error=_median(self.births),
+            velocity_error=_median(self.errors),
+            right_class=self.classed / max(self.found, 1),
+            id_switches=self.switches,
+        )
 
 
-def fusion_gains(seeds: Sequence[int] = range(10)) -> list[FusionScore]:
-    """The scores of each of `SENSOR_SETS` on the same scenes."""
-    return [_score(sensors, seeds) for sensors in SENSOR_SETS]
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else float("nan")
+
+
+def fusion_gains(drives: Iterable[Iterable[Frame]]) -> list[FusionScore]:
+    """The scores of each of `SENSOR_SETS` on the same drives.
+
+    Args:
+        drives: Of each drive the sweeps with their truth, cameras and radars, and what was found in them.
+
+    Raises:
+        SourceError: A frame has no truth.
+    """
+    tallies = [_Tally(sensors) for sensors in SENSOR_SETS]
+    for drive in drives:
+        frames = list(drive)
+        for tally in tallies:
+            tally.add_drive(frames)
+    return [tally.score() for tally in tallies]
+
+
+def evaluate_fusion(
+    uri: str, out: pathlib.Path, *, profile: str = "cpu", settings: Iterable[str] = ()
+) -> list[FusionScore]:
+    """Runs a profile's pipeline over drives of the simulator, fuses, writes `summary.json` and gives the scores.
+
+    Args:
+        uri: Such as `sim:street?seeds=1-4&duration=6`.
+        out: Folder for what is written.
+        profile: A hardware profile; its modules must give `perception/detected`.
+        settings: Changes to it, as texts `key=value`.
+
+    Raises:
+        SourceError: The source cannot be read, or knows no truth.
+        ConfigError: Profile or settings are bad.
+    """
+    from ..sources.opening import open_source
+
+    with Pipeline.from_profile(profile, settings=settings) as pipeline:
+
+        def run(each: str) -> Iterator[Frame]:
+            for frame in pipeline.run(open_source(each), topics=[_DETECTED]):
+                if not frame.failed:
+                    yield frame.sensor, frame.data[_DETECTED].detections
+
+        scores = fusion_gains(map(run, drive_uris(uri)))
+    out.mkdir(parents=True, exist_ok=True)
+    summary = {"data": uri, "scores": [score.as_dict() for score in scores]}
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    return scores
 
 
 def lines_of_gains(scores: Sequence[FusionScore]) -> list[str]:
     """A table for people."""
-    lines = [f"{'LiDAR and':16} {'recall':>7} {'>70 m':>7} {'precision':>9} {'v birth':>8} {'v':>6} {'IDS':>5}"]
+    ranges = " ".join(f"{f'{low:g}-{high:g} m':>8}" for low, high in RANGES)
+    lines = [f"{'LiDAR and':17} {ranges} {'precision':>9} {'Brier':>6} {'v birth':>8} {'v':>6} {'class':>6} {'IDS':>5}"]
     for each in scores:
+        recall = " ".join(f"{100 * value:8.1f}" for value in each.recall)
         lines.append(
-            f"{' + '.join(each.sensors) or 'nothing else':16} {100 * each.recall:7.1f} {100 * each.far_recall:7.1f} "
-            f"{100 * each.precision:9.1f} {each.birth_velocity_error:8.2f} {each.velocity_error:6.2f} "
-            f"{each.id_switches:5d}"
+            f"{' + '.join(each.sensors) or 'nothing else':17} {recall} {100 * each.precision:9.1f} "
+            f"{each.existence_error:6.3f} {each.birth_velocity_error:8.2f} {each.velocity_error:6.2f} "
+            f"{100 * each.right_class:6.1f} {each.id_switches:5d}"
         )
+    lines.append("recall of road users by distance [%] · v: median error of the velocity [m/s], at birth of what moves")
     return lines

@@ -237,16 +237,6 @@ def test_same_frames_same_bytes():
     assert run() == run()
 
 
-def test_fusion_gains_on_made_up_traffic():
-    from warploom.components.evaluation.fusion import fusion_gains
-
-    lidar, with_camera, with_radar, with_both = fusion_gains(range(2))
-    assert with_camera.far_recall > lidar.far_recall + 0.1
-    assert with_radar.far_recall > lidar.far_recall + 0.5
-    assert with_radar.birth_velocity_error < 0.6 * lidar.birth_velocity_error
-    assert min(with_both.precision, with_camera.precision, with_radar.precision) > 0.95
-
-
 @pytest.mark.parametrize(("change", "says"), [({"camera_weight": 1.0}, "camera_weight"), ({"memory": 0.0}, "memory")])
 def test_impossible_settings_are_refused(change, says):
     with pytest.raises(ValueError, match=says):
