@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import os
 import sys
 import time
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
@@ -21,36 +25,72 @@ commands = typer.Typer()
 
 Node = Annotated[str | None, typer.Option("--node", help="Which node; by default the only one that runs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="As JSON.")]
-LaunchFile = Annotated[str | None, typer.Argument(metavar="[FILE]", help="A launch file: its path or its name.")]
-Hw = Annotated[str | None, typer.Option("--hw", help="Find the launch file by its computing unit, such as hw50 …")]
-Lidar = Annotated[str | None, typer.Option("--lidar", help="… its LiDAR, such as pandar90 …")]
-Camera = Annotated[str | None, typer.Option("--camera", help="… its cameras, such as 13 …")]
-Radar = Annotated[str | None, typer.Option("--radar", help="… its radars, such as conti430.")]
-LaunchProfile = Annotated[
-    str | None, typer.Option("--profile", help="Hardware profile in place of the launch file's: a name or a path.")
-]
-Check = Annotated[bool, typer.Option("--check", help="Validate everything and look for the hardware; start nothing.")]
-SkipCheck = Annotated[
-    list[str] | None, typer.Option("--skip-check", metavar="NAME", help="Start though this preflight check fails.")
-]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The options of the commands that start a node."""
+
+    file: Annotated[str | None, typer.Argument(metavar="[FILE]", help="A launch file: its path or its name.")] = None
+    hw: Annotated[
+        str | None, typer.Option("--hw", help="Find the launch file by its computing unit, such as hw50 …")
+    ] = None
+    lidar: Annotated[str | None, typer.Option("--lidar", help="… its LiDAR, such as pandar90 …")] = None
+    camera: Annotated[str | None, typer.Option("--camera", help="… its cameras, such as 13 …")] = None
+    radar: Annotated[str | None, typer.Option("--radar", help="… its radars, such as conti430.")] = None
+    profile: Annotated[
+        str | None,
+        typer.Option("--profile", help="Hardware profile in place of the launch file's: a name or a path."),
+    ] = None
+    settings: Settings = None
+    check: Annotated[
+        bool, typer.Option("--check", help="Validate everything and look for the hardware; start nothing.")
+    ] = False
+    skip_check: Annotated[
+        list[str] | None,
+        typer.Option("--skip-check", metavar="NAME", help="Start though this preflight check fails."),
+    ] = None
+    as_json: AsJson = False
+
+    @property
+    def hardware(self) -> dict[str, str]:
+        """By which the launch file is to be found."""
+        names = ("hw", "lidar", "camera", "radar")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+def _with_start_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command, whose first argument is a `Start`, the options of it after its own."""
+    own = get_type_hints(command, include_extras=True)
+    shared = get_type_hints(Start, include_extras=True)
+    defaults = {one.name: one.default for one in inspect.signature(command).parameters.values()}
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        command(Start(**{name: values.pop(name) for name in shared}), **values)
+
+    hints = {"file": shared["file"], **{name: own[name] for name in defaults if name != "start"}, **shared}
+    run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=getattr(Start, name) if name in shared else defaults[name],
+            annotation=hint,
+        )
+        for name, hint in hints.items()
+    )
+    run.__annotations__ = hints
+    return run
 
 
 @commands.command()
+@_with_start_options
 def launch(
-    file: LaunchFile = None,
+    start: Start,
     modules: Annotated[
         list[str] | None, typer.Option("-c", "--module", metavar="MODULE", help="A module file of a single process.")
     ] = None,
     process: Annotated[str | None, typer.Option("-p", "--process", help="The name of that process.")] = None,
-    hw: Hw = None,
-    lidar: Lidar = None,
-    camera: Camera = None,
-    radar: Radar = None,
-    profile: LaunchProfile = None,
-    settings: Settings = None,
-    check: Check = False,
-    skip_check: SkipCheck = None,
-    as_json: AsJson = False,
 ) -> None:
     """Start a node and watch over its processes: of a launch file, of one found by its hardware, or a single one.
 
@@ -60,68 +100,62 @@ def launch(
     """
     from ..components.launching import plan_launch
 
-    hardware = _hardware(hw, lidar, camera, radar)
-    ways = [bool(file), bool(modules), bool(hardware)]
-    if sum(ways) != 1:
+    if bool(start.file) + bool(modules) + bool(start.hardware) != 1:
         raise typer.BadParameter("say what to launch: a launch file, or -c and -p, or --hw, --lidar, --camera, --radar")
     if bool(modules) != bool(process):
         raise typer.BadParameter("-c and -p belong together: the modules of a process, and its name")
     planned = plan_launch(
-        file, hardware=hardware, modules=modules or (), process=process, profile=profile, settings=settings or ()
+        start.file,
+        hardware=start.hardware,
+        modules=modules or (),
+        process=process,
+        profile=start.profile,
+        settings=start.settings or (),
     )
-    _launch(planned, check=check, skip=skip_check or (), as_json=as_json)
+    _launch(planned, start)
 
 
 @commands.command("start-all")
-def start_all(
-    file: LaunchFile = None,
-    hw: Hw = None,
-    lidar: Lidar = None,
-    camera: Camera = None,
-    radar: Radar = None,
-    profile: LaunchProfile = None,
-    settings: Settings = None,
-    check: Check = False,
-    skip_check: SkipCheck = None,
-    as_json: AsJson = False,
-) -> None:
+@_with_start_options
+def start_all(start: Start) -> None:
     """Start every process of a node, and the monitors beside them.
 
     Example: `warploom start-all --hw hw50 --lidar pandar90 --camera 13 --radar conti430`
     """
     from ..components.launching import monitor_processes, plan_launch
 
-    hardware = _hardware(hw, lidar, camera, radar)
-    if bool(file) == bool(hardware):
+    if bool(start.file) == bool(start.hardware):
         raise typer.BadParameter("say what to start: a launch file, or --hw, --lidar, --camera, --radar")
-    planned = plan_launch(file, hardware=hardware, profile=profile, settings=settings or (), more=monitor_processes())
-    _launch(planned, check=check, skip=skip_check or (), as_json=as_json)
+    planned = plan_launch(
+        start.file,
+        hardware=start.hardware,
+        profile=start.profile,
+        settings=start.settings or (),
+        more=monitor_processes(),
+    )
+    _launch(planned, start)
 
 
-def _hardware(*values: str | None) -> dict[str, str]:
-    names = ("hw", "lidar", "camera", "radar")
-    return {name: value for name, value in zip(names, values, strict=True) if value is not None}
-
-
-def _launch(planned: Launch, *, check: bool, skip: Any, as_json: bool) -> None:
+def _launch(planned: Launch, start: Start) -> None:
     from ..components.launching import check_launch, run_launch
     from ..dag.launch.table import JsonLines, LiveTable
 
-    findings = check_launch(planned, build=check)
-    missing = [finding for finding in findings if not finding.ok and finding.check not in skip]
-    for finding in findings if check else missing:
-        typer.echo(str(finding), err=not check)
+    findings = check_launch(planned, build=start.check)
+    skipped = start.skip_check or ()
+    missing = [finding for finding in findings if not finding.ok and finding.check not in skipped]
+    for finding in findings if start.check else missing:
+        typer.echo(str(finding), err=not start.check)
     if missing:
         names = ", ".join(dict.fromkeys(finding.check for finding in missing))
         typer.echo(f"warploom: nothing was started: preflight failed ({names})", err=True)
         raise typer.Exit(2)
-    if check:
+    if start.check:
         for process, files in planned.plan.modules.items():
             typer.echo(f"ok       process {process}: {len(files)} modules")
         typer.echo(f"{planned.plan.file.path}: node {planned.plan.node!r} is good")
         return
     level = _level()
-    if as_json or not sys.stdout.isatty():
+    if start.as_json or not sys.stdout.isatty():
         raise typer.Exit(run_launch(planned, on_event=JsonLines(), log_level=level))
     table = LiveTable()
     try:

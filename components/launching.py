@@ -186,6 +186,7 @@ def build_process(
         external=dict.fromkeys(imports, object),
         on_timing=context.timings,
         check=profile.content.check,
+        switch_interval_s=profile.content.threads.switch_interval_s,
         prepare=prepare,
     )
 
@@ -240,7 +241,7 @@ def run_launch(
         refresh=None if table is None else (REFRESH_S, table.refresh),
     )
     if table is not None:
-        table.show(supervisor)
+        table.show(supervisor.status)
     return supervisor.run()
 
 

@@ -13,13 +13,22 @@ from typing import Any
 from urllib.parse import parse_qs
 
 from ..dag import ComponentSpec, ConfigFile, nearest
+from ..dag.launch.cgroup import ControlGroups
 from ..dag.launch.plan import LaunchPlan
 from ..dag.launch.preflight import Finding, register_check
 from ..errors import ConfigError, DeviceError, ModelError, SourceError
 from .machine import memory_limit_bytes
 from .profile import Profile, profile_device
 
-__all__ = ["check_backends", "check_device", "check_memory", "check_models", "check_ports", "check_sensors"]
+__all__ = [
+    "check_backends",
+    "check_device",
+    "check_groups",
+    "check_memory",
+    "check_models",
+    "check_ports",
+    "check_sensors",
+]
 
 _GIB = 2**30
 
@@ -258,9 +267,18 @@ def _components(plan: LaunchPlan) -> Iterator[tuple[str, ComponentSpec]]:
                 yield process, component
 
 
+def check_groups(plan: LaunchPlan) -> Iterator[Finding]:
+    """Can control groups be made? Without them the processes run all the same, so that nothing is missing."""
+    asked = [process.name for process in plan.spec.processes if process.group is not None]
+    why = ControlGroups().refusal() if asked else None
+    if why is not None:
+        yield Finding("cgroups", True, f"{', '.join(asked)}: without group and limits: {why}")
+
+
 register_check("device", check_device)
 register_check("backend", check_backends)
 register_check("memory", check_memory)
 register_check("models", check_models)
 register_check("ports", check_ports)
 register_check("sensors", check_sensors)
+register_check("cgroups", check_groups)

@@ -1,11 +1,19 @@
-"""Control groups, version 2: a process is put into one below the supervisor's own."""
+"""Control groups, version 2: a process is put into one below the supervisor's own, with limits of memory and CPU."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 from pathlib import Path
 
+from .schema import LimitsSpec
+
 __all__ = ["ControlGroups"]
+
+_OWN_LEAF = "supervisor"
+_PERIOD_US = 100_000
+_WAY_OUT = "Way out: a systemd unit with Delegate=yes, or a group that root has given to this user (chown)"
 
 
 class ControlGroups:
@@ -21,30 +29,44 @@ class ControlGroups:
         self._mount = _mounted() if mount is None else mount
         self._own = (_own_group() if own is None else own).strip("/")
         self._made: list[Path] = []
+        self._moved = False
 
-    def join(self, group: str, pid: int) -> str | None:
-        """Puts a process into a group, which is made where there is none.
+    def refusal(self) -> str | None:
+        """Why no group can be made here, with the way out; None where one can. Changes nothing."""
+        if self._mount is None:
+            return "this system has no cgroup v2"
+        folder = self._mount / self._own
+        if not os.access(folder, os.W_OK):
+            return f"{folder}: not permitted. {_WAY_OUT}"
+        return None
+
+    def join(self, group: str, pid: int, limits: LimitsSpec | None = None) -> list[str]:
+        """Puts a process into a group, which is made where there is none, and limits it.
 
         Args:
             group: Its path below the supervisor's own group, such as app/compute3d_sched.
             pid: The process.
+            limits: Of the group.
 
         Returns:
-            None, or why it is not in it, with the way out: a process runs without its group, too.
+            What could not be done, with the way out: a process runs without its group and without its limits, too.
         """
         if self._mount is None:
-            return f"cgroup {group}: this system has no cgroup v2; the process runs without"
+            return [f"cgroup {group}: this system has no cgroup v2; the process runs without"]
         folder = self._mount / self._own / group
         try:
             self._make(folder)
-            (folder / "cgroup.procs").write_text(f"{pid}\n")
         except OSError as error:
-            where = error.filename or folder
-            return (
-                f"cgroup {group}: {where}: {error.strerror}; the process runs without. Way out: a systemd unit with "
-                "Delegate=yes, or a group that root has given to this user (chown)"
-            )
-        return None
+            return [f"cgroup {group}: {_told(error, folder)}; the process runs without. {_WAY_OUT}"]
+        values = {} if limits is None else limits.files(_PERIOD_US)
+        warnings = self._limit(group, folder, values) if values else []
+        try:
+            (folder / "cgroup.procs").write_text(f"{pid}\n")
+        except ProcessLookupError:  # it has ended already, which is told elsewhere
+            pass
+        except OSError as error:
+            warnings.append(f"cgroup {group}: {_told(error, folder)}; the process runs without. {_WAY_OUT}")
+        return warnings
 
     def _make(self, folder: Path) -> None:
         if folder.is_dir():
@@ -53,12 +75,57 @@ class ControlGroups:
         folder.mkdir()
         self._made.append(folder)
 
+    def _limit(self, group: str, folder: Path, values: dict[str, str]) -> list[str]:
+        """Writes the limits of a group; what cannot be limited is told."""
+        wanted = {name.partition(".")[0] for name in values}
+        try:
+            self._enable(folder.parent, wanted)
+        except OSError as error:
+            names = ", ".join(values)
+            return [f"cgroup {group}: {names}: {_told(error, folder)}; the process runs without limits. {_WAY_OUT}"]
+        warnings = []
+        for name, value in values.items():
+            try:
+                (folder / name).write_text(f"{value}\n")
+            except OSError as error:
+                warnings.append(f"cgroup {group}: {name}: {_told(error, folder)}; the process runs without this limit")
+        return warnings
+
+    def _enable(self, folder: Path, controllers: set[str]) -> None:
+        """Lets the groups in a folder, and in those between it and the supervisor's own, be limited."""
+        assert self._mount is not None, "join has looked"
+        top = self._mount / self._own
+        if folder != top:
+            self._enable(folder.parent, controllers)
+        file = folder / "cgroup.subtree_control"
+        text = " ".join(f"+{name}" for name in sorted(controllers))
+        try:
+            file.write_text(text)
+        except OSError as error:
+            # A group that processes are in passes no controllers on: the supervisor goes into one of its own.
+            if error.errno != errno.EBUSY or folder != top or self._moved:
+                raise
+            self._make(top / _OWN_LEAF)
+            (top / _OWN_LEAF / "cgroup.procs").write_text(f"{os.getpid()}\n")
+            self._moved = True
+            file.write_text(text)
+
     def close(self) -> None:
-        """Removes the groups that it made, as far as nobody is in them."""
+        """Removes the groups that it made, as far as nobody is in them; this process is back in its own."""
+        if self._moved and self._mount is not None:
+            top = self._mount / self._own
+            with contextlib.suppress(OSError):
+                (top / "cgroup.subtree_control").write_text("-cpu -memory")
+                (top / "cgroup.procs").write_text(f"{os.getpid()}\n")
+            self._moved = False
         for folder in reversed(self._made):
             with contextlib.suppress(OSError):
                 folder.rmdir()
         self._made.clear()
+
+
+def _told(error: OSError, folder: Path) -> str:
+    return f"{error.filename or folder}: {error.strerror}"
 
 
 def _mounted() -> Path | None:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from ...datamesh.transport import SharedMemoryConfig, ZenohConfig
 
-__all__ = ["BackOffSpec", "HardwareSpec", "LaunchSpec", "ProcessSpec", "RestartsSpec"]
+__all__ = ["BackOffSpec", "HardwareSpec", "LaunchSpec", "LimitsSpec", "ProcessSpec", "RestartsSpec"]
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _LARGEST_CPU = 1023
@@ -63,6 +63,41 @@ class RestartsSpec(_Spec):
     limit: int = Field(5, ge=0, le=10_000)
 
 
+_UNITS = {"": 1, "KIB": 1 << 10, "MIB": 1 << 20, "GIB": 1 << 30, "TIB": 1 << 40}
+
+
+class LimitsSpec(_Spec):
+    """What the process's group may use, with all that it starts."""
+
+    memory_max: int | None = Field(None, ge=1 << 20)
+    """Beyond it the kernel ends the process: bytes, or a text such as 4GiB [B]."""
+    cpu_max: float | None = Field(None, ge=0.01, le=1024.0)
+    """Cores: 1.5 is one and a half, on whichever CPUs."""
+    cpu_weight: int | None = Field(None, ge=1, le=10_000)
+    """Its share where others want the same cores; what is not limited has 100."""
+
+    @field_validator("memory_max", mode="before")
+    @classmethod
+    def _bytes_of_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]iB)?\s*", value, re.IGNORECASE)
+        if found is None:
+            raise ValueError(f"expected bytes, or a text such as 512MiB or 4GiB, not {value!r}")
+        return round(float(found[1]) * _UNITS[(found[2] or "").upper()])
+
+    def files(self, period_us: int) -> dict[str, str]:
+        """What is written into which files of the group."""
+        files = {}
+        if self.memory_max is not None:
+            files["memory.max"] = str(self.memory_max)
+        if self.cpu_max is not None:
+            files["cpu.max"] = f"{round(self.cpu_max * period_us)} {period_us}"
+        if self.cpu_weight is not None:
+            files["cpu.weight"] = str(self.cpu_weight)
+        return files
+
+
 class ProcessSpec(_Spec):
     """One process."""
 
@@ -75,6 +110,8 @@ class ProcessSpec(_Spec):
     """Module files: paths from the launch file's folder, or names."""
     cgroup: str | None = None
     """Its group of cgroup v2, below the supervisor's own or the root, such as app/compute3d_sched."""
+    limits: LimitsSpec = LimitsSpec()
+    """Of that group; without `cgroup` it has the name of the process."""
     cpus: list[int] = []
     """The CPUs it may run on; none: all."""
     nice: int = Field(0, ge=-20, le=19)
@@ -93,6 +130,11 @@ class ProcessSpec(_Spec):
     """How long it may take to stop before it is killed [s]."""
 
     _check_name = field_validator("name")(_is_name)
+
+    @property
+    def group(self) -> str | None:
+        """The control group that it is put into; None: it stays in the supervisor's."""
+        return self.cgroup or (self.name if self.limits != LimitsSpec() else None)
 
     @field_validator("type", mode="before")
     @classmethod

@@ -5,26 +5,25 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import Any
 
-if TYPE_CHECKING:
-    from .supervised import SupervisedProcess
-    from .supervisor import Supervisor
+from .schema import LaunchSpec
+from .supervised import SupervisedProcess
 
 __all__ = ["node_status", "topic_status"]
 
 
-def node_status(supervisor: Supervisor) -> dict[str, Any]:
-    """All processes of a node with their use of the machine, and the supervisor's own."""
-    spec = supervisor.plan.spec
+def node_status(spec: LaunchSpec, processes: Iterable[SupervisedProcess], reaped: Iterable[str] = ()) -> dict[str, Any]:
+    """All processes of a node with their use of the machine, and that of this process, which supervises them."""
     return {
         "node": spec.node,
         "description": spec.description,
         "profile": spec.profile,
         "at": time.time(),
         "supervisor": {"pid": os.getpid(), **_usage(os.getpid())},
-        "reaped": list(supervisor.reaped),
-        "processes": [_process(process) for process in supervisor.processes.values()],
+        "reaped": list(reaped),
+        "processes": [_process(process) for process in processes],
     }
 
 
@@ -81,10 +80,10 @@ def _usage(pid: int) -> dict[str, Any]:
     return {}
 
 
-def topic_status(supervisor: Supervisor) -> dict[str, Any]:
+def topic_status(processes: Iterable[SupervisedProcess]) -> dict[str, Any]:
     """All topics of a node: who commits and who reads them, their types, commits and rates, and what links lost."""
     topics: dict[str, dict[str, Any]] = {}
-    for process in supervisor.processes.values():
+    for process in processes:
         commits, rates = process.beat.get("commits", {}), process.beat.get("rates", {})
         for name, component in process.components.items():
             for topic, kind in component.get("outputs", {}).items():

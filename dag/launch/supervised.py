@@ -409,9 +409,8 @@ class SupervisedProcess:
         except OSError:
             ours.close()
             raise
-        if self.spec.cgroup is not None:
-            warning = self._groups.join(self.spec.cgroup, process.pid)
-            if warning is not None:
+        if self.spec.group is not None:
+            for warning in self._groups.join(self.spec.group, process.pid, self.spec.limits):
                 self.warn(warning)
         for warning in place(process.pid, self.spec):
             self.warn(warning)

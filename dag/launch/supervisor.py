@@ -24,6 +24,7 @@ from .plan import LaunchPlan
 from .run_folder import RotatedLog, RunFolder
 from .schema import ProcessSpec
 from .signals import SignalInbox
+from .status import node_status, topic_status
 from .supervised import FINAL, State, SupervisedProcess
 
 if TYPE_CHECKING:
@@ -246,15 +247,15 @@ class Supervisor:
             "stop": self._stop_asked,
         }
 
-    async def _ps(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        from .status import node_status
+    def status(self) -> dict[str, Any]:
+        """What `ps` is answered."""
+        return node_status(self.plan.spec, self.processes.values(), self.reaped)
 
-        return node_status(self)
+    async def _ps(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        return self.status()
 
     async def _topics(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        from .status import topic_status
-
-        return topic_status(self)
+        return topic_status(self.processes.values())
 
     def producer(self, topic: str) -> SupervisedProcess:
         """The process that commits a topic.

@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
-
-    from .supervisor import Supervisor
 
 __all__ = ["JsonLines", "LiveTable", "component_table", "process_table", "topic_table"]
 
@@ -48,13 +46,13 @@ class LiveTable:
         from rich.console import Console
         from rich.live import Live
 
-        self._supervisor: Supervisor | None = None
+        self._status: Callable[[], Mapping[str, Any]] | None = None
         self._events: list[Mapping[str, Any]] = []
         self._live = Live(console=console or Console(), auto_refresh=False, transient=False)
 
-    def show(self, supervisor: Supervisor) -> None:
-        """Begins to show a supervisor."""
-        self._supervisor = supervisor
+    def show(self, status: Callable[[], Mapping[str, Any]]) -> None:
+        """Begins to show a node, whose status the function gives as `ps` is answered."""
+        self._status = status
         self._live.start()
 
     def close(self) -> None:
@@ -69,15 +67,13 @@ class LiveTable:
 
     def refresh(self) -> None:
         """Draws once."""
-        if self._supervisor is None:
+        if self._status is None:
             return
         from rich.console import Group
         from rich.text import Text
 
-        from .status import node_status
-
         lines = [Text(event_text(event), style=_style(event)) for event in self._events]
-        self._live.update(Group(process_table(node_status(self._supervisor)), *lines), refresh=True)
+        self._live.update(Group(process_table(self._status()), *lines), refresh=True)
 
 
 def event_text(event: Mapping[str, Any]) -> str:

@@ -26,14 +26,14 @@ from pydantic import ValidationError
 
 from ...errors import ConfigError
 from ..configuration import ConfigFile, nearest, override
-from .schema import BackOffSpec, HardwareSpec, LaunchSpec, ProcessSpec, RestartsSpec
+from .schema import BackOffSpec, HardwareSpec, LaunchSpec, LimitsSpec, ProcessSpec, RestartsSpec
 
 __all__ = ["XmlLaunchFile"]
 
 _DEPTH = 8
 _BYTES = 1_000_000
 
-_NESTED = {"hardware": HardwareSpec, "back_off": BackOffSpec, "restarts": RestartsSpec}
+_NESTED = {"hardware": HardwareSpec, "back_off": BackOffSpec, "restarts": RestartsSpec, "limits": LimitsSpec}
 _OF_NODE = tuple(name for name in LaunchSpec.model_fields if name in ("node", "description", "hardware", "profile"))
 _OF_PROCESS = tuple("dag_conf" if name == "modules" else name for name in ProcessSpec.model_fields)
 

@@ -97,15 +97,12 @@ def test_an_event_is_a_line_to_read_or_of_json():
     assert json.loads(out.getvalue()) == event
 
 
-def test_the_live_table_shows_processes_and_the_last_events(monkeypatch):
-    from warploom.dag.launch import status
-
-    monkeypatch.setattr(status, "node_status", lambda supervisor: STATUS)
+def test_the_live_table_shows_processes_and_the_last_events():
     out = io.StringIO()
     table = LiveTable(Console(file=out, width=200, force_terminal=True))
     table({"event": "launching", "time": 0})  # before there is anything to show
     assert out.getvalue() == ""
-    table.show(object())
+    table.show(lambda: STATUS)
     table({"event": "died", "process": "compute", "time": 0, "reason": "was ended by SIGKILL", "last_lines": ["oops"]})
     for number in range(20):
         table({"event": "warning", "process": "compute", "time": 0, "message": f"warning {number}"})
