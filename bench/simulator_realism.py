@@ -15,8 +15,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from ..components.evaluation.kitti_objects import unpack_scan
 from ..models.simulator import PointClass, sample_scene
-from .real_scans import unpack
 
 _SENSOR_HEIGHT = 1.73
 _REACH = 40.0  # [m] of heights and pillars
@@ -67,7 +67,7 @@ def _real(data: Path) -> Iterator[np.ndarray]:
     for path in sorted((data / "kitti_object" / "velodyne").glob("*.bin")):
         yield np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
     for path in sorted((data / "kitti_tracking" / "velodyne_packed" / "0000").glob("*.npz"))[::10]:
-        yield unpack(path)
+        yield unpack_scan(path)[:, :3]
     for path in sorted((data / "semantic_kitti" / "full").glob("*.bin"))[::3]:
         yield np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
 

@@ -13,11 +13,15 @@ import warp as wp
 
 from .device import resolve_device
 
-__all__ = ["REGRESSION_MAPS", "CenterDecode"]
+__all__ = ["OVERLAP_MAP", "REGRESSION_MAPS", "CenterDecode"]
 
 REGRESSION_MAPS = 10
 """After the heat maps (logits): dx dy [cells from the centre], z [m above ground], log l w h, cos and sin of 2 yaw,
 cos and sin of yaw."""
+
+OVERLAP_MAP = 1
+"""One more map may follow: how far the box is thought to overlap the object, as twice the intersection over union
+less one."""
 
 
 @wp.func
@@ -47,12 +51,45 @@ def _is_peak(maps: wp.array3d(dtype=wp.float32), fold: int, kind: int, row: int,
     return peak
 
 
+@wp.func
+def _score(
+    maps: wp.array3d(dtype=wp.float32), fold: int, kinds: int, kind: int, row: int, column: int, weight: float
+) -> float:
+    """The probability of a peak, and where `weight` is not zero, its weighted geometric mean with the overlap."""
+    score = 1.0 / (1.0 + wp.exp(-_at(maps, fold, kind, row, column)))
+    if weight > 0.0:
+        overlap = wp.clamp(0.5 * (_at(maps, fold, kinds + 10, row, column) + 1.0), 0.0, 1.0)
+        score = wp.pow(score, 1.0 - weight) * wp.pow(overlap, weight)
+    return score
+
+
+@wp.func
+def _is_object(
+    maps: wp.array3d(dtype=wp.float32),
+    fold: int,
+    kinds: int,
+    kind: int,
+    row: int,
+    column: int,
+    least: float,
+    weight: float,
+    least_score: float,
+) -> bool:
+    """Whether a cell is a peak and, where the overlap counts, its score is high enough with it."""
+    if not _is_peak(maps, fold, kind, row, column, least):
+        return False
+    return weight <= 0.0 or _score(maps, fold, kinds, kind, row, column, weight) >= least_score
+
+
 @wp.kernel
 def _count_peaks(
     # in
     maps_in: wp.array3d(dtype=wp.float32),
     fold: int,
     least: float,
+    kinds: int,
+    weight: float,
+    least_score: float,
     # out
     peaks_out: wp.array(dtype=wp.int32),
 ):
@@ -60,7 +97,7 @@ def _count_peaks(
     kind, row = wp.tid()  # pyright: ignore[reportAssignmentType]
     found = int(0)
     for column in range(maps_in.shape[2] << fold):
-        if _is_peak(maps_in, fold, kind, row, column, least):
+        if _is_object(maps_in, fold, kinds, kind, row, column, least, weight, least_score):
             found += 1
     peaks_out[kind * (maps_in.shape[1] << fold) + row] = found
 
@@ -78,6 +115,8 @@ def _write_boxes(
     low_y: float,
     cell: float,
     kinds: int,
+    weight: float,
+    least_score: float,
     # out
     boxes_out: wp.array2d(dtype=wp.float32),
     scores_out: wp.array(dtype=wp.float32),
@@ -96,7 +135,7 @@ def _write_boxes(
         return
     slot = ends_in[line] - peaks_in[line]
     for column in range(maps_in.shape[2] << fold):
-        if _is_peak(maps_in, fold, kind, row, column, least):
+        if _is_object(maps_in, fold, kinds, kind, row, column, least, weight, least_score):
             if slot < capacity:
                 axis = 0.5 * wp.atan2(
                     _at(maps_in, fold, kinds + 7, row, column), _at(maps_in, fold, kinds + 6, row, column)
@@ -114,7 +153,7 @@ def _write_boxes(
                         wp.clamp(_at(maps_in, fold, kinds + 3 + size, row, column), -4.0, 4.0)
                     )
                 boxes_out[slot, 6] = axis
-                scores_out[slot] = 1.0 / (1.0 + wp.exp(-_at(maps_in, fold, kind, row, column)))
+                scores_out[slot] = _score(maps_in, fold, kinds, kind, row, column, weight)
                 classes_out[slot] = kind
             slot += 1
 
@@ -134,7 +173,7 @@ class CenterDecode:
     shape: tuple[int, int, int]
     """Maps, rows (along y), columns (along x)."""
     classes: int
-    """Heat maps, which come first; `REGRESSION_MAPS` follow."""
+    """Heat maps, which come first; `REGRESSION_MAPS` follow, and perhaps the `OVERLAP_MAP`."""
     origin: tuple[float, float]
     """Lowest x and y of the maps [m]."""
     cell: float
@@ -144,12 +183,19 @@ class CenterDecode:
     unfold: int = 1
     """Blocks of so many by so many cells are folded into channels, a power of two: what a network computes at a coarser
     step and says at this one. Channel (m · unfold + row mod unfold) · unfold + column mod unfold is of map m."""
+    overlap_weight: float = 0.0
+    """Share a of the overlap map in a score: p^(1 − a) · overlap^a (CIA-SSD, Zheng et al., AAAI 2021); 0: none."""
     device: str = "cpu"
     """A Warp device, such as `cpu` or `cuda:0`."""
 
     def __post_init__(self):
-        if self.shape[0] != self.classes + REGRESSION_MAPS:
-            raise ValueError(f"shape must begin with {self.classes} + {REGRESSION_MAPS} maps, not {self.shape[0]}")
+        fewest = self.classes + REGRESSION_MAPS
+        if self.shape[0] not in (fewest, fewest + OVERLAP_MAP):
+            raise ValueError(
+                f"shape must begin with {self.classes} + {REGRESSION_MAPS} maps, or one more, not {self.shape[0]}"
+            )
+        if not 0.0 <= self.overlap_weight < 1.0 or (self.overlap_weight and self.shape[0] == fewest):
+            raise ValueError(f"overlap_weight must be in [0, 1), and 0 without its map, not {self.overlap_weight}")
         if self.unfold < 1 or self.unfold & (self.unfold - 1) or any(n % self.unfold for n in self.shape[1:]):
             raise ValueError(f"unfold must be a power of two that divides rows and columns, not {self.unfold}")
         object.__setattr__(self, "_fold", self.unfold.bit_length() - 1)
@@ -181,16 +227,20 @@ class CenterDecode:
             height = self._height
             height.fill_(float(sensor_height))
         p = min(max(score_threshold, 1e-6), 1.0 - 1e-6)
-        least = math.log(p / (1.0 - p))
+        # With a weight, what the peak itself must reach is what it takes where the overlap is perfect.
+        p **= 1.0 / (1.0 - self.overlap_weight)
+        least, weighting = math.log(p / (1.0 - p)), [self.classes, self.overlap_weight, float(score_threshold)]
         lines = (self.classes, self.shape[1])
         device = self.scores.device
         flat = maps[0]
-        wp.launch(_count_peaks, lines, inputs=[flat, self._fold, least], outputs=[self._peaks], device=device)
+        wp.launch(
+            _count_peaks, lines, inputs=[flat, self._fold, least, *weighting], outputs=[self._peaks], device=device
+        )
         wp.utils.array_scan(self._peaks, self._ends, inclusive=True)
         wp.launch(
             _write_boxes,
             lines,
-            inputs=[flat, self._fold, least, self._ends, self._peaks, height, *self.origin, self.cell, self.classes],
+            inputs=[flat, self._fold, least, self._ends, self._peaks, height, *self.origin, self.cell, *weighting],
             outputs=[self.boxes, self.scores, self.classes_found, self.count, self.dropped],
             device=device,
         )

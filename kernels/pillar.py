@@ -53,6 +53,7 @@ def _clear_pillars(
     # in
     shown_in: wp.array(dtype=wp.uint32),
     sums_in: wp.array2d(dtype=wp.int64),
+    places_in: wp.array(dtype=wp.int32),
     # in out
     grid: wp.array3d(dtype=wp.float32),
 ):
@@ -68,10 +69,11 @@ def _clear_pillars(
             column = cell - row * grid.shape[2]
             bits = sums_in[cell, _SHOWN]
             for s in range(_SLICES):
-                if (int(bits) >> s) & 1 != 0:
-                    grid[s, row, column] = 0.0
+                if (int(bits) >> s) & 1 != 0 and places_in[s] >= 0:
+                    grid[places_in[s], row, column] = 0.0
             for channel in range(_SLICES, _SLICES + 5):
-                grid[channel, row, column] = 0.0
+                if places_in[channel] >= 0:
+                    grid[places_in[channel], row, column] = 0.0
 
 
 @wp.kernel
@@ -123,10 +125,17 @@ def _sum_pillars(
         wp.atomic_min(sums, cell, _LOW, above)
 
 
+@wp.func
+def _put(grid: wp.array3d(dtype=wp.float32), channel: int, row: int, column: int, value: float):
+    if channel >= 0:
+        grid[channel, row, column] = value
+
+
 @wp.kernel
 def _write_pillars(
     # in
     lowest: float,
+    places_in: wp.array(dtype=wp.int32),
     # in out
     occupied: wp.array(dtype=wp.uint32),
     sums: wp.array2d(dtype=wp.int64),
@@ -151,14 +160,14 @@ def _write_pillars(
             column = cell - row * grid.shape[2]
             bits = sums[cell, _BITS]
             for s in range(_SLICES):
-                if (int(bits) >> s) & 1 != 0:
-                    grid[s, row, column] = 1.0
+                if (int(bits) >> s) & 1 != 0 and places_in[s] >= 0:
+                    grid[places_in[s], row, column] = 1.0
             share = 1.0 / float(sums[cell, _POINTS])
-            grid[_SLICES, row, column] = float(sums[cell, _DX]) * share / 4096.0 - 0.5
-            grid[_SLICES + 1, row, column] = float(sums[cell, _DY]) * share / 4096.0 - 0.5
-            grid[_SLICES + 2, row, column] = float(sums[cell, _Z]) * share / 1000.0 + lowest
-            grid[_SLICES + 3, row, column] = float(sums[cell, _HIGH]) / 1000.0 + lowest
-            grid[_SLICES + 4, row, column] = float(sums[cell, _LOW]) / 1000.0 + lowest
+            _put(grid, places_in[_SLICES], row, column, float(sums[cell, _DX]) * share / 4096.0 - 0.5)
+            _put(grid, places_in[_SLICES + 1], row, column, float(sums[cell, _DY]) * share / 4096.0 - 0.5)
+            _put(grid, places_in[_SLICES + 2], row, column, float(sums[cell, _Z]) * share / 1000.0 + lowest)
+            _put(grid, places_in[_SLICES + 3], row, column, float(sums[cell, _HIGH]) / 1000.0 + lowest)
+            _put(grid, places_in[_SLICES + 4], row, column, float(sums[cell, _LOW]) / 1000.0 + lowest)
             for field in range(_HIGH + 1):
                 sums[cell, field] = wp.int64(0)
             sums[cell, _LOW] = _CEILING
@@ -170,14 +179,16 @@ class PillarGrid:
     """A plan: the grid of one cloud of up to `capacity` points; only the cells that held points are cleared.
 
     Attributes:
-        grid: The network's input, shape (1, C, H, W), float32: channels of `pillar_channels`, rows along y, columns
-            along x. Offsets in cells from the cell's centre, heights [m] above the ground.
+        grid: The network's input, shape (1, C, H, W), float32: `channels`, rows along y, columns along x. Offsets in
+            cells from the cell's centre, heights [m] above the ground.
     """
 
     point_range: tuple[float, float, float, float, float, float] = (-60.0, -60.0, -2.0, 60.0, 60.0, 6.0)
     """xmin ymin zmin xmax ymax zmax [m], upper bounds open; z is the height above the ground."""
     cell: float = 0.25
     """Edge of a cell [m]."""
+    channels: tuple[str, ...] = pillar_channels()
+    """Which of `pillar_channels` are drawn, in their order; the others cost nothing."""
     capacity: int
     """Points that one launch can take."""
     device: str = DEFAULT_DEVICE
@@ -201,6 +212,9 @@ class PillarGrid:
             raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
         if (high[2] - low[2]) * 1000.0 >= 2**31:
             raise ValueError(f"point_range must be less than 2³¹ mm high, not {low[2]} … {high[2]} m")
+        every = pillar_channels()
+        if not self.channels or self.channels != tuple(name for name in every if name in self.channels):
+            raise ValueError(f"channels must be some of {', '.join(every)}, in that order, not {self.channels}")
         if self.method not in ("auto", "rows", "shared"):
             raise ValueError(f"method must be 'auto', 'rows' or 'shared', not {self.method!r}")
         if self.parts is not None and self.parts < 1:
@@ -221,7 +235,7 @@ class PillarGrid:
             keep(name, wp.zeros(shape, dtype=dtype, device=device))
 
         keep("_by_rows", by_rows)
-        buffer("grid", (1, PILLAR_SLICES + 5, rows, columns), wp.float32)
+        buffer("grid", (1, len(self.channels), rows, columns), wp.float32)
         keep("_grid", self.grid[0])
         buffer("_height", 1, wp.float32)
         if by_rows:
@@ -229,6 +243,7 @@ class PillarGrid:
             spec.low, spec.high = wp.vec3(*low), wp.vec3(*high)
             spec.inverse_cell, spec.inverse_slice = 1.0 / self.cell, 1.0 / SLICE_HEIGHT
             spec.rows, spec.columns, spec.words, spec.slices = rows, columns, words, PILLAR_SLICES
+            spec.channels = sum(1 << k for k, name in enumerate(every) if name in self.channels)
             keep("_spec", spec)
             keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
             keep("_described", [wp.empty(self.capacity, dtype=wp.int32, device=device) for _ in range(3)])
@@ -237,6 +252,8 @@ class PillarGrid:
             buffer("_shown", rows * words, wp.uint32)
             buffer("_shown_slices", rows * words * 32, wp.uint32)
             return
+        place = {name: k for k, name in enumerate(self.channels)}
+        keep("_places", wp.array([place.get(name, -1) for name in every], dtype=wp.int32, device=device))
         cells = columns * rows
         buffer("_sums", (cells, int(_ROW)), wp.int64)
         self._sums[:, int(_LOW)].fill_(2**31 - 1)
@@ -267,7 +284,9 @@ class PillarGrid:
             return
         words = self._occupied.shape[0]
         device = self.grid.device
-        wp.launch(_clear_pillars, words, inputs=[self._shown, self._sums], outputs=[self._grid], device=device)
+        wp.launch(
+            _clear_pillars, words, inputs=[self._shown, self._sums, self._places], outputs=[self._grid], device=device
+        )
         wp.launch(
             _sum_pillars,
             xyz.shape[0],
@@ -287,7 +306,7 @@ class PillarGrid:
         wp.launch(
             _write_pillars,
             words,
-            inputs=[self.point_range[2]],
+            inputs=[self.point_range[2], self._places],
             outputs=[self._occupied, self._sums, self._grid, self._shown],
             device=device,
         )

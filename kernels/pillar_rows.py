@@ -29,6 +29,7 @@ class PillarSpec:
     columns: int
     words: int  # of 32 cells in a row, the last one possibly not full
     slices: int
+    channels: int  # bit c: channel c is drawn; those that are follow each other
 
 
 @wp.func_native("""
@@ -197,7 +198,8 @@ def _sum(
             float* __restrict to = grid.data + (long long)row * columns + 32 * in_row;
             const int length = columns - 32 * in_row < 32 ? columns - 32 * in_row : 32;
             // By halves of a word, each a line of the cache.
-            for (int slice = 0; slice < slices; ++slice, to += plane) {
+            for (int slice = 0; slice < slices; ++slice) {
+                if (!(spec.channels >> slice & 1)) continue;
                 const unsigned bits = in_slice[slice];
                 unsigned differ = ~0u;
                 if (!everything) {
@@ -210,13 +212,17 @@ def _sum(
                     if (length == 32) for (int k = half; k < half + 16; ++k) to[k] = bits >> k & 1 ? 1.0f : 0.0f;
                     else for (int k = half; k < length; ++k) to[k] = bits >> k & 1 ? 1.0f : 0.0f;
                 }
+                to += plane;
             }
-            for (int mean = 0; mean < MEANS; ++mean, to += plane)
+            for (int mean = 0; mean < MEANS; ++mean) {
+                if (!(spec.channels >> (slices + mean) & 1)) continue;
                 for (int half = 0; half < 32; half += 16) {
                     if (!(changed >> half & 0xFFFF)) continue;
                     if (length == 32) for (int k = half; k < half + 16; ++k) to[k] = value[mean][k];
                     else for (int k = half; k < length; ++k) to[k] = value[mean][k];
                 }
+                to += plane;
+            }
         }
 """)
 def _draw(

@@ -35,6 +35,7 @@ DEFAULT_CARD = Path(__file__).parent / "weights" / "pillar_center.yaml"
 
 _HIGHEST_OPSET = 17
 _REGRESSION = ("dx", "dy", "z", "log_l", "log_w", "log_h", "cos_2yaw", "sin_2yaw", "cos_yaw", "sin_yaw")
+_OVERLAP = "iou"
 
 
 class _Strict(BaseModel):
@@ -48,7 +49,7 @@ class InputSpec(_Strict):
     shape: tuple[int, int, int, int]
     """1, C, H (along y), W (along x)."""
     channels: tuple[str, ...]
-    """Names of the C channels, in order."""
+    """Names of the C channels, some of `kernels.pillar.pillar_channels` in their order."""
     point_range: tuple[float, float, float, float, float, float]
     """xmin ymin zmin xmax ymax zmax [m]; x and y about the sensor, z above the ground."""
     cell: float = Field(gt=0)
@@ -64,6 +65,12 @@ class OutputSpec(_Strict):
     unfold: int = Field(1, ge=1)
     """Blocks of so many by so many cells are folded into channels, see `kernels.decode.CenterDecode`."""
     regression: tuple[str, ...]
+    """Names of the maps after the classes'; the last may be `iou`, see `kernels.decode.CenterDecode`."""
+
+    @property
+    def overlap(self) -> bool:
+        """Whether the last map says how far each box is thought to overlap its object."""
+        return self.regression[-1] == _OVERLAP
 
     @property
     def unfolded(self) -> tuple[int, int, int]:
@@ -74,8 +81,8 @@ class OutputSpec(_Strict):
     @field_validator("regression")
     @classmethod
     def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if value != _REGRESSION:
-            raise ValueError(f"this version decodes {', '.join(_REGRESSION)}")
+        if value not in (_REGRESSION, (*_REGRESSION, _OVERLAP)):
+            raise ValueError(f"this version decodes {', '.join(_REGRESSION)}, and perhaps {_OVERLAP} after them")
         return value
 
 
@@ -87,6 +94,8 @@ class DecodeSpec(_Strict):
     score_threshold: float = Field(ge=0, le=1)
     nms_iou: float = Field(gt=0, le=1)
     """Of two boxes that overlap more than this from above, the better stays, whatever their classes."""
+    overlap_weight: float = Field(0.0, ge=0, lt=1)
+    """Share of the thought overlap in a score."""
     max_candidates: int = Field(ge=1)
     max_objects: int = Field(ge=1)
 
@@ -151,6 +160,8 @@ class HeadCard(LidarCard):
         wanted_out = (len(self.classes) + len(self.output.regression), rows // stride, columns // stride)
         if self.output.unfolded != wanted_out:
             return f"output.shape {self.output.shape} does not follow from classes, regression and stride: {wanted_out}"
+        if self.decode.overlap_weight and not self.output.overlap:
+            return f"decode.overlap_weight is {self.decode.overlap_weight}, but output.regression has no {_OVERLAP}"
         return ""
 
 

@@ -37,7 +37,11 @@ class _Slot:
         decode = card.decode
         self.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.pillars = PillarGrid(
-            point_range=card.input.point_range, cell=card.input.cell, capacity=capacity, device=device
+            point_range=card.input.point_range,
+            cell=card.input.cell,
+            channels=card.input.channels,
+            capacity=capacity,
+            device=device,
         )
         self.decode = CenterDecode(
             shape=card.output.unfolded,
@@ -46,6 +50,7 @@ class _Slot:
             origin=card.input.point_range[:2],
             cell=card.input.cell * decode.stride,
             capacity=decode.max_candidates,
+            overlap_weight=decode.overlap_weight,
             device=device,
         )
         self.nms = RotatedNms(
@@ -98,9 +103,11 @@ class DetectionHead:
         self.device = resolve_device(device)
         self.score_threshold = self.card.decode.score_threshold if score_threshold is None else score_threshold
         self.batch = batch
-        if self.card.input.channels != pillar_channels():
+        asked = self.card.input.channels
+        if asked != tuple(name for name in pillar_channels() if name in asked):
             raise ModelError(
-                f"{model}: the card's channels are not those that this version computes: {', '.join(pillar_channels())}"
+                f"{model}: the card's channels must be some of those that this version computes, in this order: "
+                f"{', '.join(pillar_channels())}"
             )
         self._network = Network(
             model,

@@ -78,7 +78,13 @@ def quantize_head(
     except ImportError as error:
         raise ModelError(f"{card}: to quantise a head takes the onnx package: pip install onnx ({error})") from error
     old, model = load_card(card)
-    grid = PillarGrid(point_range=old.input.point_range, cell=old.input.cell, capacity=1 << 18, device="cpu")
+    grid = PillarGrid(
+        point_range=old.input.point_range,
+        cell=old.input.cell,
+        channels=old.input.channels,
+        capacity=1 << 18,
+        device="cpu",
+    )
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{old.name}_int8.onnx"

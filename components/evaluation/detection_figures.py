@@ -148,6 +148,7 @@ def _at(kind: str, outcomes: list[FrameOutcome], score: float, review: Review | 
     if review is not None:
         figures["reviewed_as_real"] = sum(len(each.excused) for each in judged)
     if kind == "range":
+        figures["and_without_labels"] = round(sum(len(each.in_dont_care) for each in judged) / len(judged), 3)
         return {"car_points_in_boxes": _car_points(judged, score)} | figures
     tasks = {}
     turns, sizes = [np.empty(0)], [np.empty((0, 3))]

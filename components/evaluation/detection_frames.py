@@ -2,8 +2,9 @@
 
 A URI names each: `kitti:DIR?sequence=0000&every=5` (object or tracking set; scans in `velodyne` or, losslessly packed,
 in `velodyne_packed`), `sim:street?seed=3&every=10` (a drive), `sim:scenes?seeds=500-529&lidar=hdl64` (one scan of each
-random scene), `nuscenes:DIR` (key frames with an mmdetection3d `info.json`), `range:DIR?labels=semantic_kitti` (range
-images with a class for each pixel). Every one takes `height`, the sensor's above the ground [m].
+random scene; people's boxes as labels have them, see `models.training.frames.labelled_boxes`), `nuscenes:DIR` (key
+frames with an mmdetection3d `info.json`), `range:DIR?labels=semantic_kitti` (range images with a class for each pixel).
+Every one takes `height`, the sensor's above the ground [m].
 """
 
 from __future__ import annotations
@@ -58,6 +59,8 @@ class PointLabels:
     """Shape (n,), bool."""
     vehicle: np.ndarray
     """Cars, trucks, buses; shape (n,), bool."""
+    known: np.ndarray
+    """Points that have a label at all: what is far is often left without; shape (n,), bool."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,7 +162,7 @@ def _kitti(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFra
 
 def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFrame]:
     from ...models.simulator import Simulator, sample_scene
-    from ...models.training.frames import height_over_ground
+    from ...models.training.frames import height_over_ground, labelled_boxes
 
     if place == "scenes":
         options = _Keys(uri, keys, ("seeds", "lidar", "height"))
@@ -185,7 +188,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
             kind="sim",
             points=frame.points,
             sensor_height=height_over_ground(frame.points, frame.ground) if height is None else height,
-            boxes=np.asarray(frame.boxes, np.float64),
+            boxes=labelled_boxes(np.asarray(frame.boxes, np.float64), frame.classes),
             classes=frame.classes,
             types=tuple("object" for _ in frame.classes),
             counts=frame.counts,
@@ -267,5 +270,5 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
             types=(),
             counts=np.empty(0, np.int64),
             velocities=np.empty((0, 2)),
-            point_labels=PointLabels(car=np.isin(labels, cars), vehicle=np.isin(labels, vehicles)),
+            point_labels=PointLabels(car=np.isin(labels, cars), vehicle=np.isin(labels, vehicles), known=labels > 0),
         )

@@ -36,10 +36,10 @@ class FrameOutcome:
     found: Detections
     """From the least score on."""
     seen: np.ndarray
-    """Of the detections: where there are labels, which is the camera's view in KITTI's sets less the DontCare areas;
-    shape (k,), bool."""
+    """Of the detections: where there are labels, which is the camera's view in KITTI's sets less the DontCare areas,
+    and in range images where at least half of a box's points have a label; shape (k,), bool."""
     in_dont_care: np.ndarray
-    """Indices of vehicles at the score in question that would be false but for a DontCare area."""
+    """Indices of vehicles at the score in question that would be false but for a DontCare area or lacking labels."""
     seconds: float
     """From points to boxes."""
     false: np.ndarray
@@ -58,7 +58,13 @@ class FrameOutcome:
 
 
 def _views(frame: EvaluationFrame, found: Detections) -> tuple[np.ndarray, np.ndarray]:
-    """Which detections have their centre in the camera's image, and which of these lie outside of DontCare areas."""
+    """Which detections have their centre in the camera's image, and which of these lie outside of DontCare areas.
+
+    Of a range image all are seen, and those in question where points have labels: SemanticKITTI's end at 50 m.
+    """
+    if frame.point_labels is not None:
+        within = points_in_boxes(frame.points, found.boxes, margin=BOXES_GROWN)
+        return np.ones(len(found), bool), 2 * (within & frame.point_labels.known).sum(axis=1) >= within.sum(axis=1)
     if frame.kitti is None:
         return np.ones(len(found), bool), np.ones(len(found), bool)
     pixels, depth = frame.kitti.calibration.project(found.boxes) if len(found) else (np.empty((0, 2)), np.empty(0))
@@ -93,7 +99,7 @@ def judge(
 
     A vehicle is false in KITTI's sets where the camera sees it, within 70 m, outside of DontCare areas, and no labelled
     vehicle is within 2 m; elsewhere wherever no vehicle is within 2 m; in range images where its box, grown by 0.1 m,
-    holds fewer than 3 points of vehicles.
+    holds fewer than 3 points of vehicles, and half of its points have a label.
     """
     seen, labelled = _views(frame, found)
     all_false = _false_vehicles(frame, found, seen, score)

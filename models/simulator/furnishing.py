@@ -6,6 +6,7 @@ import numpy as np
 
 from .library import KINDS, prototype
 from .street import Street, StreetPlan
+from .vehicles import VEHICLE_KINDS
 
 __all__ = ["furnish", "grow", "populate"]
 
@@ -282,12 +283,13 @@ def furnish(street: Street, plan: StreetPlan, parked: float) -> None:
 def grow(street: Street, plan: StreetPlan, density: float) -> None:
     """Lets hedges, thickets, bushes and trees grow where there is room beside the street.
 
-    Real suburbs have three times as many points on plants as streets without it (`bench/simulator_realism.py`).
+    Real suburbs have three times as many points on plants as streets without it (`bench/simulator_realism.py`). Scrub,
+    sheds and heaps stand among them, and plants that touch parked cars: what is easily taken for a car, or hides one.
 
     Args:
         street: As furnished so far.
         plan: Its measures.
-        density: From 0, nothing, to 1: green walls on both sides.
+        density: From 0, nothing, to 1.5: green walls on both sides.
     """
     random, add = street.random, street.add
     low, high = plan.extent
@@ -313,6 +315,37 @@ def grow(street: Street, plan: StreetPlan, density: float) -> None:
                     margin=-0.3)  # fmt: skip
             else:
                 add("tree", s, side * (line + 0.8 + back), random.uniform(0, 6.3))
+        for _ in range(int(density * random.uniform(0.0, 0.5) * (high - low))):
+            s, d = random.uniform(low, high), line + random.uniform(0.3, 6.0) * random.choice([1.0, 1.0, 6.0])
+            if plan.open_at(s, plan.sidewalk + 2.0):
+                add("scrub", s, side * d, random.uniform(0, 6.3), margin=-0.3)
+        for _ in range(random.integers(0, 6)):
+            s, d = random.uniform(low, high), line + random.uniform(1.0, 6.0) * random.choice([1.0, 4.0])
+            if plan.open_at(s, plan.sidewalk + 3.0):
+                turned = random.choice([0.0, np.pi / 2]) + random.normal(0, 0.2)
+                add(("shed", "heap")[random.integers(2)], s, side * d, turned)
+    _overgrow(street, plan)
+
+
+def _overgrow(street: Street, plan: StreetPlan) -> None:
+    """Lets a plant touch some of the vehicles that stand beside the street or at its edge."""
+    random, things = street.random, street.things
+    parked = [
+        k
+        for k in range(len(things))
+        if things.kind[k] in VEHICLE_KINDS
+        and not things.motion[k][0]
+        and abs(things.pose[k][1]) > plan.half_width - 2.5
+    ]
+    for k in random.permutation(parked)[: random.integers(0, 1 + len(parked) // 3 + 1)]:
+        s, d, yaw, _ = things.pose[k]
+        width = float(prototype(things.kind[k], things.variant[k]).size[1])
+        kind = ("bush", "scrub", "hedge")[random.integers(3)]
+        variant = int(random.integers(KINDS[kind]))
+        away = 0.5 * width + 0.5 * float(prototype(kind, variant).size[1]) + random.uniform(-0.15, 0.4)
+        away *= 1.0 if np.cos(yaw) * d > 0 else -1.0  # behind it, as seen from the street
+        street.add(kind, s - away * np.sin(yaw) + random.uniform(-1, 1) * np.cos(yaw), d + away * np.cos(yaw), yaw,
+                   variant=variant, force=True)  # fmt: skip
 
 
 def populate(street: Street, plan: StreetPlan, *, walkers: int, riders: int, cars: int, works: int) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...kernels.meshes import MeshSet
 from ..classes import BARRIER, CONE, CYCLIST, PEDESTRIAN, VEHICLE
-from . import people, structures, vegetation, vehicles
+from . import people, structures, vegetation, vehicles, yards
 from .mesh import Shape
 
 __all__ = ["KINDS", "VISIBILITY_RAYS", "Library", "Prototype", "object_class", "prototype"]
@@ -24,6 +24,7 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "bush": vegetation.bush,
     "hedge": vegetation.hedge,
     "thicket": vegetation.thicket,
+    "scrub": vegetation.scrub,
     "facade": structures.facade,
     "wall": structures.wall,
     "fence": structures.fence,
@@ -38,12 +39,14 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "bus_stop": structures.bus_stop,
     "table": structures.table,
     "stairs": structures.stairs,
+    "shed": yards.shed,
+    "heap": yards.heap,
     "cone": structures.cone,
     "barrier": structures.barrier,
 }
 _VARIANTS = {
     "tree": 16, "bush": 24, "hedge": 10, "thicket": 14, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8,
-    "sign": 8, "bollard": 4,
+    "sign": 8, "bollard": 4, "scrub": 18, "shed": 10, "heap": 10,
     "bin": 6, "cabinet": 8, "hydrant": 2, "bike_rack": 8, "motorbike": 5, "bus_stop": 3, "table": 6, "stairs": 6,
     "cone": 4, "barrier": 8, "pedestrian": 24, "stander": 8, "cyclist": 12,
 }  # fmt: skip

@@ -23,6 +23,7 @@ __all__ = ["SceneBatch", "sample_scene", "sample_views"]
 
 _PERIOD = 0.1  # [s]
 _DRAWN = ("vlp16", "hdl32", "vlp32", "xt32", "pandar40", "hdl64", "pandar64", "pandar90", "vls128", "os1_128")
+_OFTEN = {"hdl64": 11.0, "pandar64": 4.0}
 _workshop = threading.local()
 
 
@@ -35,14 +36,15 @@ class _Scene:
 
 
 def _drawn_lidar(random: np.random.Generator) -> Lidar:
-    weights = np.array([6.0 if LIDARS[name].lines == 64 else 1.0 for name in _DRAWN])
+    weights = np.array([_OFTEN.get(name, 1.0) for name in _DRAWN])
     return LIDARS[_DRAWN[random.choice(len(_DRAWN), p=weights / weights.sum())]]
 
 
 def _draw(random: np.random.Generator, mounting_height: float | None, turning: bool) -> _Scene:
     style = STYLES[random.choice(len(STYLES), p=[0.35, 0.3, 0.2, 0.15])]
     share = random.uniform(0.25, 0.95)
-    street, plan = random_street(random, style=style, extent=(-75.0, 75.0), crossings=int(random.integers(0, 3)))
+    street, plan = random_street(random, style=style, extent=(-75.0, 75.0), crossings=int(random.integers(0, 3)),
+                                 banks=True)  # fmt: skip
     s, d = random.uniform(-12, 12), random.choice([-1, 1]) * random.uniform(0.8, max(1.0, plan.half_width - 1.2))
     street.block(s, d, 2.4)
     populate(street, plan, walkers=0, riders=int(random.integers(0, 7)), cars=int(random.integers(1, 11)),
@@ -64,7 +66,7 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
     mount = mounting(mounting_height or height, random.normal(0, 0.012), random.normal(0, 0.01))
     speed = random.uniform(0.0, 14.0) if turning and random.random() < 0.8 else 0.0
     # Last, so that it changes nothing else of the scenes.
-    grow(street, plan, random.uniform(0.0, 1.0 if style != "urban" else 0.5))
+    grow(street, plan, random.uniform(0.1, 1.5 if style != "urban" else 0.7))
 
     def pose_at(t: float) -> np.ndarray:
         one = np.ones(1)

@@ -23,7 +23,7 @@ _CAR_NAMES, _CAR_SHARES = tuple(_CARS), np.array(list(_CARS.values())) / sum(_CA
 
 # What counts of a thing that others may stand under, or grow into.
 _TRUNKS = {"tree": np.array([0.7, 0.7]), "lamp_post": np.array([0.4, 0.4]), "sign": np.array([0.4, 0.4])}
-_SHARES = {"bush": 0.7, "thicket": 0.75, "hedge": 0.95}
+_SHARES = {"bush": 0.7, "thicket": 0.75, "hedge": 0.95, "scrub": 0.6}
 _CELL = 5.0  # [m] edge of a cell of the map of what is taken; no circle in it is wider
 
 
@@ -192,6 +192,7 @@ def random_street(
     parking: tuple[bool, bool] | None = None,
     sidewalk: float | None = None,
     half_width: float | None = None,
+    banks: bool = False,
 ) -> tuple[Street, StreetPlan]:
     """A street with everything that stands still, and its measures; traffic comes afterwards.
 
@@ -206,6 +207,7 @@ def random_street(
         parking: Whether cars park on the left and on the right; None draws it.
         sidewalk: Width of the sidewalks [m]; None draws it.
         half_width: Of the carriageway with its parking lanes [m]; None draws it.
+        banks: Whether the land beside it may rise and fall in embankments.
     """
     parking = parking or (bool(random.random() < 0.7), bool(random.random() < 0.7))
     if sidewalk is None:
@@ -234,6 +236,7 @@ def random_street(
         crossings=places,
         hilly=hilly,
         curvature=bend * random.choice([0.0, random.normal(0, 0.0025)]),
+        banks=banks,
     )
     street = Street(ground, random, duration)
     return street, plan

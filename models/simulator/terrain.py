@@ -92,6 +92,7 @@ def street_ground(
     reach: float = 75.0,
     hilly: float = 1.0,
     curvature: float = 0.0,
+    banks: bool = False,
 ) -> Ground:
     """The ground of a street with side streets.
 
@@ -104,6 +105,7 @@ def street_ground(
         reach: How far it goes to either side [m].
         hilly: Factor on slopes and bumps.
         curvature: Of the centre line [1/m].
+        banks: Whether the land beside the street may rise and fall in embankments and mounds.
     """
     ramp = 0.03
     across = [
@@ -138,6 +140,9 @@ def street_ground(
     z += random.normal(0, 0.035, z.shape) * (outside > 0.3)
     z += random.normal(0, 0.004, z.shape)
 
+    if banks:
+        z += _banks(random, S, D, outside)
+
     sc, dc = 0.5 * (s[1:] + s[:-1]), 0.5 * (d[1:] + d[:-1])
     SC, DC = np.meshgrid(sc, dc, indexing="ij")
     road, walk = np.abs(DC) < half_width + ramp, np.abs(DC) < half_width + sidewalk
@@ -153,3 +158,29 @@ def street_ground(
     labels = np.where(walk, _SIDEWALK, labels)
     labels = np.where(road, np.where(marking & (np.abs(DC) < half_width), _MARKING, _ROAD), labels)
     return Ground(s=s, d=d, z=z, labels=labels.astype(np.int32), curvature=curvature)
+
+
+def _banks(random: np.random.Generator, s: np.ndarray, d: np.ndarray, outside: np.ndarray) -> np.ndarray:
+    """Heights to add beside the street: on each side perhaps an embankment, and mounds further out [m].
+
+    Args:
+        random: Source of chance.
+        s: Of the grid's corners, along the street [m].
+        d: Across [m].
+        outside: Distance of the corners from sidewalks and side streets [m].
+    """
+    z = np.zeros_like(s)
+    for side in (1, -1):
+        foot, rise = (
+            random.uniform(0.3, 10.0),
+            random.choice([0.0, random.uniform(-1.2, 0.0), random.uniform(0.2, 2.4)]),
+        )
+        width = 0.8 + abs(rise) * random.uniform(2.0, 6.0)
+        climbed = np.clip((outside - foot) / width, 0.0, 1.0)
+        z += (side * d > 0) * rise * climbed * climbed * (3.0 - 2.0 * climbed)
+    for _ in range(4):
+        length, heading, phase = random.uniform(9, 30), random.uniform(0, np.pi), random.uniform(0, 2 * np.pi)
+        height = random.uniform(0.0, 0.012) * length
+        wave = np.sin(2 * np.pi / length * (s * np.cos(heading) + d * np.sin(heading)) + phase)
+        z += height * wave * np.clip(outside / 6.0, 0.0, 1.0)
+    return z

@@ -7,7 +7,7 @@ import numpy as np
 from .labels import Material, PointClass, face_label
 from .mesh import Shape, box, join, leaves, tube
 
-__all__ = ["bush", "hedge", "thicket", "tree"]
+__all__ = ["bush", "hedge", "scrub", "thicket", "tree"]
 
 _BARK = face_label(Material.BARK, PointClass.VEGETATION)
 _LEAVES = face_label(Material.LEAVES, PointClass.VEGETATION)
@@ -111,4 +111,17 @@ def thicket(random: np.random.Generator) -> Shape:
         parts.append(leaves(points, random.uniform(0.22, 0.36), _LEAVES, random))
         stem = np.array([centre * [1, 1, 0], centre + random.normal(0, 0.3, 3), centre + radii * [0, 0, 0.8]])
         parts.append(tube(stem, np.array([0.07, 0.05, 0.02]), _BARK, 5))
+    return join(*parts)
+
+
+def scrub(random: np.random.Generator) -> Shape:
+    """Tall grass, brambles or seedlings: a ragged patch of 2 to 6 m, 0.2 to 1.4 m high, that most beams enter."""
+    length, depth, height = random.uniform(2, 6), random.uniform(1, 4), random.uniform(0.2, 1.4)
+    parts = []
+    for _ in range(random.integers(3, 9)):
+        radii = np.array([random.uniform(0.2, 0.9), random.uniform(0.2, 0.9), height * random.uniform(0.4, 1.0)])
+        at = np.array([random.uniform(-0.5, 0.5) * length, random.uniform(-0.5, 0.5) * depth, 0.0])
+        points = at + _cloud(int(random.uniform(25, 110)), radii, random, 0.1)
+        points[:, 2] = np.abs(points[:, 2])
+        parts.append(leaves(points, random.uniform(0.06, 0.2), _LEAVES, random))
     return join(*parts)

@@ -23,11 +23,14 @@ def main(
     views: Annotated[int, typer.Option(help="Scans of each simulated street: more cost less time a scan.")] = 1,
     stem: Annotated[int, typer.Option(help="Channels of the network at 0.5 m.")] = 24,
     lean: Annotated[bool, typer.Option("--lean", help="Look at 16 of the 20 pillar channels.")] = False,
-    extra: Annotated[list[str] | None, typer.Option(help="Also learn iou, vx or vy; they are not exported.")] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option(help="Also learn iou, vx or vy; vx and vy are not exported.")
+    ] = None,
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
     start_from: Annotated[Path | None, typer.Option(help="Begin with the weights of this checkpoint.")] = None,
     learning_rate: Annotated[float, typer.Option(help="The highest of the cycle.")] = 3e-3,
     threads: Annotated[int, typer.Option(help="CPU threads of the network.")] = 1,
+    loader: Annotated[bool, typer.Option("--loader", help="Let a process beside draw the batches.")] = False,
     workers: Annotated[int, typer.Option(help="Processes that simulate.")] = 1,
     workers_nice: Annotated[int, typer.Option(help="How far those stand back for other processes.")] = 10,
 ) -> None:
@@ -54,6 +57,7 @@ def main(
         start_from=start_from,
         learning_rate=learning_rate,
         threads=threads,
+        loaders=int(loader),
         workers=workers,
         workers_nice=workers_nice,
     )

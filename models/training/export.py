@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
-from ...kernels.pillar import pillar_channels
 from ..card import DecodeSpec, HeadCard, InputSpec, OutputSpec, file_sha256, save_card
 from .network import HEAD_CLASSES, REGRESSION, STRIDE, UNFOLD, PillarCenterNet
 
@@ -26,6 +26,7 @@ def export_head(
     point_range: tuple[float, float, float, float, float, float] = (-60.0, -60.0, -2.0, 60.0, 60.0, 6.0),
     cell: float = 0.25,
     score_threshold: float = 0.3,
+    overlap_weight: float = 0.0,
     training: dict[str, Any],
     measured: dict[str, Any] | None = None,
     description: str = "",
@@ -39,6 +40,7 @@ def export_head(
         point_range: What the head is to see; the network is convolutional, so it may be other than in training.
         cell: As in training [m].
         score_threshold: What the card recommends.
+        overlap_weight: Share of the thought overlap in a score, of a network that says it.
         training: What the card says of the training.
         measured: What the card says was measured.
         description: A sentence or two.
@@ -48,10 +50,11 @@ def export_head(
     """
     folder.mkdir(parents=True, exist_ok=True)
     columns, rows = (round((point_range[axis + 3] - point_range[axis]) / cell) for axis in (0, 1))
-    channels = pillar_channels()
     network = copy.deepcopy(network).eval().to(memory_format=torch.contiguous_format)
     # The decoder reads the maps folded as they are: unfolding them takes one thread 5 ms, and is a copy.
     network.unfold = torch.nn.Identity()
+    extras = _one_last_layer(network)
+    regression, channels = (*REGRESSION, *extras), network.channels
     model = folder / f"{name}.onnx"
     with warnings.catch_warnings():
         # The TorchScript exporter is the one that folds batch norms into the convolutions.
@@ -82,16 +85,21 @@ def export_head(
             name="maps",
             shape=(
                 1,
-                (len(HEAD_CLASSES) + len(REGRESSION)) * UNFOLD**2,
+                (len(HEAD_CLASSES) + len(regression)) * UNFOLD**2,
                 rows // (STRIDE * UNFOLD),
                 columns // (STRIDE * UNFOLD),
             ),
             unfold=UNFOLD,
-            regression=REGRESSION,
+            regression=regression,
         ),
         classes=HEAD_CLASSES,
         decode=DecodeSpec(
-            stride=STRIDE, score_threshold=score_threshold, nms_iou=0.2, max_candidates=1024, max_objects=256
+            stride=STRIDE,
+            score_threshold=score_threshold,
+            nms_iou=0.2,
+            overlap_weight=overlap_weight,
+            max_candidates=1024,
+            max_objects=256,
         ),
         training=training,
         measured=measured or {},
@@ -100,3 +108,22 @@ def export_head(
     path = folder / f"{name}.yaml"
     save_card(path, card)
     return path
+
+
+def _one_last_layer(network: PillarCenterNet) -> tuple[str, ...]:
+    """Lets the last layer say the overlap too, if the network knows it; velocities, which one scan hardly shows, not.
+
+    Returns:
+        What it says after `REGRESSION`.
+    """
+    if network.extra is None or "iou" not in network.extras:
+        return ()
+    first = network.extras.index("iou") * UNFOLD**2
+    old, more = network.head, network.extra
+    head = nn.Conv2d(old.in_channels, old.out_channels + UNFOLD**2, 1)
+    weights, further = old.state_dict(), more.state_dict()
+    head.load_state_dict(
+        {name: torch.cat([value, further[name][first : first + UNFOLD**2]]) for name, value in weights.items()}
+    )
+    network.head = head
+    return ("iou",)

@@ -8,18 +8,21 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+from torch.utils.data import DataLoader, IterableDataset
 
 from ...kernels.pillar import PillarGrid, pillar_channels
 from .frames import (
     Augmentation,
     TrainingFrame,
     augment,
+    labelled_boxes,
     load_frame,
     save_frame,
     simulate_frame,
@@ -68,6 +71,8 @@ class TrainingConfig:
     average: float = 0.998
     """Decay of the running average of the weights, which is what is exported."""
     threads: int = 1
+    loaders: int = 0
+    """1: a process beside this one draws the batches; the same batches."""
     workers: int = 1
     """Processes that make frames."""
     workers_nice: int = 10
@@ -80,6 +85,8 @@ class TrainingConfig:
         if (self.minutes is None) == (self.iterations is None):
             raise ValueError("give either minutes or iterations, not both and not neither")
         cells = 2.0 * self.window / self.cell
+        if self.loaders not in (0, 1):
+            raise ValueError(f"loaders must be 0 or 1, not {self.loaders}")
         if self.views < 1:
             raise ValueError(f"views must be at least 1, not {self.views}")
         if cells != round(cells) or round(cells) % (4 * STRIDE):
@@ -144,6 +151,7 @@ def _sample(
     frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
     """Input and targets of one variation of a frame."""
+    frame = replace(frame, boxes=labelled_boxes(frame.boxes, frame.classes))
     varied = augment(frame, rng, config.augmentation)
     xyz = np.ascontiguousarray(varied.xyz)[: grid.capacity]
     points = wp.array(ptr=xyz.ctypes.data, dtype=wp.vec3, shape=(len(xyz),), device="cpu")
@@ -163,21 +171,48 @@ def _sample(
     return grid.grid.numpy()[0].copy(), *maps
 
 
-def _batches(config: TrainingConfig, paths: Callable[[], list[Path]], start: int) -> Iterator[list[torch.Tensor]]:
-    """Batches without end; batch i depends on the seed, i and the frames there are."""
-    window = config.window
-    grid = PillarGrid(
-        point_range=(-window, -window, -2.0, window, window, 6.0), cell=config.cell, capacity=1 << 18, device="cpu"
-    )
-    iteration = start
-    while True:
-        rng = np.random.default_rng([config.seed, iteration])
-        there = paths()
-        samples = []
-        for choice in rng.integers(len(there), size=config.batch):
-            samples.append(_sample(load_frame(there[choice]), grid, config, rng))
-        yield [torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True)]
-        iteration += 1
+class _Batches(IterableDataset):
+    """Batches without end; batch i depends on the seed, i and the frames there are.
+
+    A process beside the one that trains may draw them: what it takes to read, vary and draw four crops is a third of
+    what it takes to learn from them.
+    """
+
+    def __init__(self, config: TrainingConfig, start: int):
+        self._config, self._start = config, start
+
+    def __iter__(self) -> Iterator[list[torch.Tensor]]:
+        """The batches from the first on."""
+        config, window = self._config, self._config.window
+        grid = PillarGrid(
+            point_range=(-window, -window, -2.0, window, window, 6.0), cell=config.cell, channels=config.channels,
+            capacity=1 << 18, device="cpu",
+        )  # fmt: skip
+        look = _frames_there(config)
+        iteration = self._start
+        while True:
+            rng = np.random.default_rng([config.seed, iteration])
+            there = look()
+            samples = []
+            for choice in rng.integers(len(there), size=config.batch):
+                samples.append(_sample(load_frame(there[choice]), grid, config, rng))
+            yield [torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True)]
+            iteration += 1
+
+
+def _stand_back(_: int) -> None:
+    torch.set_num_threads(1)
+
+
+def _batches(config: TrainingConfig, start: int) -> Iterator[list[torch.Tensor]]:
+    if config.loaders == 0:
+        return iter(_Batches(config, start))
+    return iter(
+        DataLoader(
+            _Batches(config, start), batch_size=None, num_workers=1, prefetch_factor=4, worker_init_fn=_stand_back,
+            multiprocessing_context="spawn",
+        )
+    )  # fmt: skip
 
 
 def _rate(progress: float, peak: float) -> float:
@@ -196,6 +231,12 @@ def _running_average(decay: float) -> Callable[[torch.Tensor, torch.Tensor, int]
         return torch.lerp(kept, new, 1.0 - min(decay, (1.0 + int(steps)) / (10.0 + int(steps))))
 
     return average
+
+
+def averaged_weights(checkpoint: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """The running average of a checkpoint's weights, named as the network's are."""
+    prefix = "module."
+    return {name[len(prefix) :]: value for name, value in checkpoint["averaged"].items() if name.startswith(prefix)}
 
 
 def _start_workers(config: TrainingConfig) -> list[multiprocessing.Process]:
@@ -256,9 +297,7 @@ def train(config: TrainingConfig) -> TrainingResult:
         _log.info("resuming from iteration %d, minute %.1f", iteration, spent)
     elif config.start_from is not None:
         state = torch.load(config.start_from, weights_only=True)
-        network.load_state_dict(state["network"])
-        averaged.load_state_dict(state["averaged"])
-        optimiser.load_state_dict(state["optimiser"])
+        network.begin_with(averaged_weights(state))
         _log.info("starting from %s at its iteration %d", config.start_from, state["iteration"])
 
     workers = _start_workers(config)
@@ -288,7 +327,7 @@ def train(config: TrainingConfig) -> TrainingResult:
 
     network.train()
     last_saved = time.monotonic()
-    for batch in _batches(config, there, iteration):
+    for batch in _batches(config, iteration):
         minutes = (time.monotonic() - began) / 60.0
         progress = iteration / config.iterations if config.iterations else minutes / float(config.minutes or 1.0)
         if progress >= 1.0:

@@ -22,7 +22,7 @@ REGRESSION = ("dx", "dy", "z", "log_l", "log_w", "log_h", "cos_2yaw", "sin_2yaw"
 the heading twice: of the axis, which is never ambiguous, and of the object, which only chooses the axis's sign."""
 
 EXTRAS = ("iou", "vx", "vy")
-"""What a further branch can say of each cell: how well the box there fits, as twice its overlap less one (CIA-SSD,
+"""What more the network can say of each cell: how well the box there fits, as twice its overlap less one (CIA-SSD,
 Zheng et al. 2021), and the velocity over ground along the grid's axes [10 m/s]."""
 
 LEAN_CHANNELS = (*pillar_channels()[:11], *pillar_channels()[-5:])
@@ -63,8 +63,8 @@ class PillarCenterNet(nn.Module):
     Args:
         width: Channels at 0.5, 1 and 2 m.
         depth: Residual blocks at 1 and 2 m.
-        channels: The pillar channels that it looks at, of those of `pillar_channels`, which it is given all.
-        extras: Of `EXTRAS`, what the further branch says; it is not exported.
+        channels: The pillar channels that it is given, of those of `pillar_channels`.
+        extras: Of `EXTRAS`, what it says besides.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PillarCenterNet(nn.Module):
         fine, middle, coarse = width
         outputs = len(HEAD_CLASSES) + len(REGRESSION)
         self.extras = tuple(extras)
-        self._chosen = None if channels == there else [there.index(name) for name in channels]
+        self.channels = tuple(channels)
         self.stem = _convolution(len(channels), fine, stride=2)
         self.down1 = nn.Sequential(_convolution(fine, middle, stride=2), *(_Residual(middle) for _ in range(depth[0])))
         self.down2 = nn.Sequential(
@@ -99,12 +99,10 @@ class PillarCenterNet(nn.Module):
         with torch.no_grad():
             self.head.bias[: len(HEAD_CLASSES) * UNFOLD**2] = -4.6
         # Made last, so that a seed gives the same weights with and without it.
-        self.extra = nn.Sequential(
-            _convolution(middle, middle), nn.Conv2d(middle, len(extras) * UNFOLD**2, 1), nn.PixelShuffle(UNFOLD)
-        ) if extras else None  # fmt: skip
+        self.extra = nn.Conv2d(middle, len(extras) * UNFOLD**2, 1) if extras else None
 
     def _features(self, pillars: torch.Tensor) -> torch.Tensor:
-        half = self.stem(pillars if self._chosen is None else pillars[:, self._chosen])
+        half = self.stem(pillars)
         one = self.down1(half)
         two = self.down2(one)
         return self.merge(one + self.up(self.lateral(two)))
@@ -114,6 +112,33 @@ class PillarCenterNet(nn.Module):
         return self.unfold(self.head(self._features(pillars)))
 
     def forward_all(self, pillars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """The maps, and those of the further branch, shape (n, extras, H / 2, W / 2), None without one."""
+        """The maps, and those of `extras`, shape (n, extras, H / 2, W / 2), None without any."""
         features = self._features(pillars)
-        return self.unfold(self.head(features)), None if self.extra is None else self.extra(features)
+        return self.unfold(self.head(features)), None if self.extra is None else self.unfold(self.extra(features))
+
+    def begin_with(self, state: dict[str, torch.Tensor]) -> None:
+        """Takes over the weights of another network of this kind, of which it may be wider or know more or less.
+
+        Where shapes differ, the common part is copied; what is new among a layer's inputs begins at zero for the
+        outputs that were there, so that these say at first what they did (Net2Net, Chen et al., ICLR 2016), and new
+        outputs begin at random.
+
+        Args:
+            state: Its `state_dict`.
+        """
+        own = self.state_dict()
+        every = pillar_channels()
+        for name, mine in own.items():
+            if name not in state:
+                continue
+            given = state[name]
+            if name == "stem.0.weight" and given.shape[1] == len(every) and len(self.channels) < len(every):
+                given = given[:, [every.index(channel) for channel in self.channels]]
+            if mine.shape == given.shape:
+                mine.copy_(given)
+                continue
+            common = tuple(slice(min(a, b)) for a, b in zip(mine.shape, given.shape, strict=True))
+            if mine.dim() == 4:
+                mine[common[0]] = 0.0
+            mine[common] = given[common]
+        self.load_state_dict(own)

@@ -37,7 +37,7 @@ def reference(maps, threshold, height):
                     axis += np.pi
                 size = np.exp(np.clip([ll, lw, lh], -4, 4))
                 rows.append(
-                    [kind, score, -8 + (c + 0.5 + dx) * 0.5, -6 + (r + 0.5 + dy) * 0.5, z - height, *size, axis]
+                    [kind, score, -8 + (c + 0.5 + dx) * 0.5, -6 + (r + 0.5 + dy) * 0.5, z - height, *size, axis, r, c]
                 )
     return np.array(rows)
 
@@ -110,3 +110,35 @@ def test_folded_maps_give_the_same_bytes_as_unfolded_ones(unfold, device):
 def test_an_unfolding_that_does_not_divide_the_maps_is_refused(unfold):
     with pytest.raises(ValueError, match="power of two that divides"):
         CenterDecode(shape=SHAPE, classes=3, origin=(0, 0), cell=0.5, capacity=4, unfold=unfold)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize("unfold", [1, 2])
+def test_a_thought_overlap_weighs_in_the_score(weight, unfold, device):
+    """p^(1 - a) overlap^a of every peak in double precision, those below the threshold left out; within 1e-5."""
+    rng = np.random.default_rng(9)
+    maps = np.concatenate([rng.normal(0, 1.2, SHAPE), rng.uniform(-1.3, 1.3, (1, *SHAPE[1:]))]).astype(np.float32)
+    m, rows, columns = maps.shape
+    folded = maps.reshape(m, rows // unfold, unfold, columns // unfold, unfold).transpose(0, 2, 4, 1, 3)
+    folded = np.ascontiguousarray(folded.reshape(m * unfold**2, rows // unfold, columns // unfold))
+    decode = CenterDecode(
+        shape=maps.shape, classes=3, origin=(-8.0, -6.0), cell=0.5, capacity=512, unfold=unfold, overlap_weight=weight,
+        device=device,
+    )  # fmt: skip
+    boxes, scores, kinds = run(decode, folded, 0.55)
+    every = reference(maps[:-1], 0.0, 1.5)
+    overlap = np.clip(
+        0.5 * (maps[-1, every[:, 9].astype(int), every[:, 10].astype(int)].astype(np.float64) + 1.0), 0, 1
+    )
+    every[:, 1] = every[:, 1] ** (1.0 - weight) * overlap**weight
+    expected = every[every[:, 1] >= 0.55]
+    assert len(expected) > 20
+    np.testing.assert_array_equal(kinds, expected[:, 0])
+    np.testing.assert_allclose(scores, expected[:, 1], atol=1e-5)
+    np.testing.assert_allclose(boxes[:, :6], expected[:, 2:8], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(("maps", "weight"), [(13, 0.5), (14, 1.0), (14, -0.1)])
+def test_a_weight_without_its_map_or_out_of_range_is_refused(maps, weight):
+    with pytest.raises(ValueError, match="overlap_weight must be"):
+        CenterDecode(shape=(maps, 4, 4), classes=3, origin=(0, 0), cell=0.5, capacity=4, overlap_weight=weight)

@@ -114,6 +114,22 @@ def test_methods_and_parts_give_the_same_bytes_scan_after_scan(columns):
 
 
 @pytest.mark.parametrize("way", WAYS, ids=str)
+@pytest.mark.parametrize("chosen", [(0, 3, 14), (15, 18, 19), (2, 16), tuple(range(20))], ids=str)
+def test_some_of_the_channels_are_those_of_all_scan_after_scan(way, chosen):
+    rng = np.random.default_rng(7)
+    names = tuple(pillar_channels()[k] for k in chosen)
+    plan = PillarGrid(point_range=RANGE, capacity=4096, channels=names, **way)
+    for n in (3000, 7, 0, 4096):
+        points = cloud(rng, 4096)
+        plan.launch(wp.array(points[:, :3].copy(), dtype=wp.vec3, device="cpu"), count_on(n, "cpu"), 1.7)
+        assert plan.grid.shape == (1, len(chosen), 96, 128)
+        expected = reference(points[:n], 1.7)[list(chosen)]
+        np.testing.assert_allclose(plan.grid.numpy()[0], expected, atol=2e-3)
+        whole = pillarize(points[:n], sensor_height=1.7, point_range=RANGE)
+        assert plan.grid.numpy()[0].tobytes() == whole[list(chosen)].tobytes()
+
+
+@pytest.mark.parametrize("way", WAYS, ids=str)
 def test_a_captured_launch_replays_on_the_cpu(way):
     points = cloud(np.random.default_rng(4), 500)
     plan = PillarGrid(point_range=RANGE, capacity=512, **way)
@@ -193,6 +209,9 @@ def test_a_launch_is_captured_in_a_graph():
         ({"point_range": (0, 0, 0, 1, float("inf"), 1)}, "finite"),
         ({"method": "fast"}, "method must be 'auto', 'rows' or 'shared'"),
         ({"parts": 0}, "parts must be at least 1"),
+        ({"channels": ()}, "channels must be some of below, z0.00"),
+        ({"channels": ("z0.25", "z0.00")}, "in that order"),
+        ({"channels": ("z9.00",)}, "channels must be some of"),
         ({"capacity": 0}, "capacity must be"),
         ({"point_range": (-9, -9, -3e6, 9, 9, 3e6)}, "less than 2³¹ mm high"),
     ],

@@ -68,6 +68,9 @@ def test_a_missing_model_and_a_missing_card_are_named(card_path):
         ({"opset": 16}, "its opset is 17, but the card"),
         ({"opset": 18}, "opset"),
         ({"decode__nms_iou": 2.0}, "decode.nms_iou"),
+        ({"decode__overlap_weight": 0.5}, "overlap_weight is 0.5, but output.regression has no iou"),
+        ({"decode__overlap_weight": 1.0}, "decode.overlap_weight"),
+        ({"output__regression": ["dx", "dy"]}, "this version decodes dx, dy"),
         ({"surprise": 1}, "surprise"),
         ({"sha256": "abc"}, "sha256"),
         ({"file": "../pillar_center.onnx"}, "file: .*must be the name of a file beside the card"),
@@ -93,7 +96,7 @@ def test_a_card_that_does_not_fit_is_refused(card_path, changes, message):
             },
             "its input is",
         ),
-        ({"input__channels": [f"c{k}" for k in range(20)]}, "channels are not those"),
+        ({"input__channels": [f"c{k}" for k in range(20)]}, "channels must be some of those"),
     ],
 )
 def test_a_model_that_does_not_fit_its_card_is_refused_before_it_runs(card_path, changes, message):

@@ -8,12 +8,15 @@ from typer.testing import CliRunner
 
 from warploom.cli import app
 from warploom.components.evaluation.detection import evaluate_detection, write_summary
+from warploom.components.evaluation.detection_figures import figures_of
 from warploom.components.evaluation.detection_frames import evaluation_frames
+from warploom.components.evaluation.detection_outcomes import judge
 from warploom.components.evaluation.detection_report import write_report
 from warploom.components.evaluation.detection_reviews import Review
 from warploom.components.evaluation.kitti_objects import label_files, read_results, unpack_scan
 from warploom.errors import ConfigError, SourceError
 from warploom.models.classes import VEHICLE
+from warploom.models.detections import Detections
 
 P = "721.5 0 609.6 44.9 0 721.5 172.9 0.2 0 0 1 0.003"
 CALIBRATION = (
@@ -191,3 +194,26 @@ def test_a_nuscenes_frame_is_turned_to_look_forward(shared_data):
 
     inside = points_in_boxes(frame.points, frame.boxes, margin=0.05).sum(axis=1)
     assert np.corrcoef(inside, frame.counts)[0, 1] > 0.95
+
+
+def test_where_a_range_image_has_no_labels_nothing_is_false(tmp_path):
+    """Three boxes of equal points: on a car, on what is labelled something else, and on what has no label."""
+    xyz = np.full((1, 90, 3), 0.0, np.float32)
+    xyz[0, :, 0] = np.repeat([10.0, 20.0, 55.0], 30) + np.tile(np.linspace(-1, 1, 30), 3)
+    label = np.repeat([1, 15, 0], 30)[None]
+    np.savez(tmp_path / "0.npz", xyz=xyz, depth=np.linalg.norm(xyz, axis=2), label=label)
+    frame = next(evaluation_frames(f"range:{tmp_path}"))
+    assert frame.point_labels.known.sum() == 60
+    found = Detections(
+        boxes=np.array([[x, 0, 0, 4, 2, 2, 0] for x in (10, 20, 55)], np.float32),
+        scores=np.full(3, 0.9, np.float32),
+        classes=np.zeros(3, np.int32),
+        velocities=np.full((3, 2), np.nan, np.float32),
+        background=np.zeros(3, bool),
+    )
+    outcome = judge(frame, found, 0.0, 0.5, None)
+    assert outcome.false.tolist() == [1]
+    assert outcome.in_dont_care.tolist() == [2]
+    figures = figures_of("range", [outcome], 0.5, (), None)["at"]["0.5"]
+    assert (figures["false_vehicles_per_frame"], figures["and_without_labels"]) == (1.0, 1.0)
+    assert figures["car_points_in_boxes"] == 1.0

@@ -68,3 +68,15 @@ def test_slopes_are_those_of_the_heights():
     along, across = field.slope(np.array([0.0]), np.array([0.0]))
     assert abs(along[0]) < 0.12
     assert abs(across[0]) < 0.12
+
+
+def test_banks_leave_the_street_and_its_side_streets_as_they_are():
+    arguments = {"extent": (-60, 60), "half_width": 4.0, "sidewalk": 2.0, "crossings": [(15.0, 3.0)]}
+    rough = 0
+    for seed in range(6):
+        flat, banked = (street_ground(np.random.default_rng(seed), banks=banks, **arguments) for banks in (False, True))
+        s, d = np.meshgrid(flat.s, flat.d, indexing="ij")
+        paved = (np.abs(d) <= 6.0) | (np.abs(s - 15.0) <= 5.0)
+        np.testing.assert_array_equal(banked.z[paved], flat.z[paved])
+        rough += np.abs(banked.z - flat.z).max() > 0.5
+    assert rough >= 3

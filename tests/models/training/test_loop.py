@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from warploom.models.card import load_card
+from warploom.models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from warploom.models.head import DetectionHead
 from warploom.models.training.export import export_head
 from warploom.models.training.frames import (
     Augmentation,
     TrainingFrame,
     augment,
+    labelled_boxes,
     load_frame,
     save_frame,
     simulate_frame,
@@ -133,29 +135,71 @@ def test_fewer_channels_and_a_further_branch_learn_too(tmp_path, frames_folder):
     recipe = described(settings, result)["recipe"]
     assert recipe["extras"] == list(EXTRAS)
     assert len(recipe["channels"]) == 16
-    # What is exported takes and gives what every head does.
-    path = export_head(result.network, tmp_path / "head", point_range=(-8, -8, -2, 8, 8, 6), training={})
-    card, _ = load_card(path)
-    assert card.input.shape == (1, 20, 64, 64)
+    # Velocities are not exported, the overlap is: the file says what the network does.
+    path = export_head(
+        result.network, tmp_path / "head", point_range=(-8, -8, -2, 8, 8, 6), training={}, overlap_weight=0.5
+    )
+    card, model = load_card(path)
+    assert card.input.channels == LEAN_CHANNELS
+    assert card.input.shape == (1, 16, 64, 64)
+    assert card.output.regression == (*REGRESSION, "iou")
+    import onnxruntime
+
+    pillars = torch.rand(1, 16, 64, 64)
+    got = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"]).run(
+        None, {"pillars": pillars.numpy()}
+    )[0]
+    with torch.no_grad():
+        maps, said = result.network.eval().forward_all(pillars)
+    expected = torch.nn.functional.pixel_unshuffle(torch.cat([maps, said[:, :1]], 1), card.output.unfold)
+    np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)
     frame = scene(3, reach=6.0)
-    DetectionHead(path, threads=1).detect_points(frame.xyz, frame.sensor_height)
+    found = DetectionHead(path, threads=1, score_threshold=0.05).detect_points(frame.xyz, frame.sensor_height)
+    assert len(found) > 0
 
 
-def test_the_channels_left_out_make_no_difference():
+def test_a_wider_network_begins_where_a_narrower_one_was():
+    """What is new adds nothing at first; the four channels that it is not given are empty here."""
     torch.manual_seed(0)
-    network = PillarCenterNet((8, 8, 8), channels=LEAN_CHANNELS, extras=("vx",)).eval()
+    old = PillarCenterNet((8, 8, 8))
+    old.train()(torch.rand(4, 20, 32, 32))
+    new = PillarCenterNet((12, 8, 8), channels=LEAN_CHANNELS, extras=("iou",))
+    new.begin_with(old.state_dict())
     pillars = torch.rand(1, 20, 32, 32)
-    other = pillars.clone()
-    other[:, 11:15] = torch.rand(1, 4, 32, 32)
-    maps, said = network.forward_all(pillars)
-    assert torch.equal(maps, network(other))
-    assert said.shape == (1, 1, 16, 16)
+    pillars[:, 11:15] = 0.0
+    kept = torch.cat([pillars[:, :11], pillars[:, 15:]], 1)
+    with torch.no_grad():
+        torch.testing.assert_close(new.eval()(kept), old.eval()(pillars), atol=1e-5, rtol=1e-5)
+
+
+def test_names_that_there_are_not_are_refused():
     for options, message in (
         ({"channels": ("z9",)}, "channels must be of"),
         ({"extras": ("mass",)}, "extras must be of"),
     ):
         with pytest.raises(ValueError, match=message):
             PillarCenterNet((8, 8, 8), **options)
+
+
+def test_a_process_beside_draws_the_same_batches(tmp_path, frames_folder):
+    from warploom.models.training.loop import _batches
+
+    ways = [_batches(config(tmp_path, frames_folder, 3, loaders=loaders), 0) for loaders in (0, 1)]
+    for _ in range(3):
+        for one, other in zip(*(next(way) for way in ways), strict=True):
+            assert one.numpy().tobytes() == other.numpy().tobytes()
+    with pytest.raises(ValueError, match="loaders must be 0 or 1"):
+        config(tmp_path, frames_folder, 3, loaders=2)
+
+
+def test_people_have_room_in_their_labels_and_stand_where_they_did():
+    boxes = np.array([[1, 2, 0.85, 0.3, 0.5, 1.7, 0.3], [4, 5, 0.9, 1.7, 0.6, 1.8, 1.0], [9, 9, 1, 4, 2, 1.5, 0.2]])
+    labelled = labelled_boxes(boxes, np.array([PEDESTRIAN, CYCLIST, VEHICLE]))
+    np.testing.assert_allclose(labelled[0, 3:6], [0.7, 0.6, 1.75])
+    np.testing.assert_allclose(labelled[1, 3:6], [1.7, 0.7, 1.85])
+    np.testing.assert_array_equal(labelled[2], boxes[2])
+    np.testing.assert_array_equal(labelled[:, [0, 1, 6]], boxes[:, [0, 1, 6]])
+    np.testing.assert_allclose(labelled[:, 2] - labelled[:, 5] / 2, boxes[:, 2] - boxes[:, 5] / 2)
 
 
 @pytest.mark.parametrize("seed", range(5))
