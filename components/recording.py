@@ -238,6 +238,10 @@ def replay_lines(workers: int | None, result: ReplayResult, changed: Sequence[st
     fed = ", ".join(f"{count} of {topic}" for topic, count in sorted(result.fed.items())) or "nothing"
     lines = [f"{who}: given {fed}"]
     lines += [f"  {name} is not what it was when the recording was made" for name in changed]
+    lines += [
+        f"  {topic}: its message has other fields than when the recording was made; compared with those of today"
+        for topic in result.other_fields
+    ]
     lines += [f"  {topic}: {count} commits equal" for topic, count in sorted(result.equal.items())]
     lines += [f"  {d.topic} at {d.version} (epoch {d.epoch}): {d.what}" for d in result.differences[:_SHOWN]]
     if result.different > _SHOWN:
@@ -251,6 +255,16 @@ def replay_lines(workers: int | None, result: ReplayResult, changed: Sequence[st
     else:
         lines.append(f"  NOT bit-exact: {result.different} differences, {result.equal.total()} commits equal")
     return lines
+
+
+def _held_by(recording: Recording) -> tuple[list[str], dict[str, tuple[int, int]]]:
+    """The topics of which values are in a recording, and the lowest and the highest version of each."""
+    versions: dict[str, tuple[int, int]] = {}
+    for event in recording:
+        if event.payload is not None:
+            first, last = versions.get(event.topic, (event.version, event.version))
+            versions[event.topic] = min(first, event.version), max(last, event.version)
+    return sorted(versions), versions
 
 
 @dataclass
@@ -299,7 +313,7 @@ def play_recording(
         SinkError: The new recording cannot be created.
     """
     recording = Recording(path)
-    known = sorted({event.topic for event in recording if event.payload is not None})
+    known, versions = _held_by(recording)
     with ExitStack() as stack:
         mesh, process, pipeline = DataMesh(), None, None
         if profile is not None:
@@ -314,6 +328,11 @@ def play_recording(
         played = list(topics) or [
             topic for topic in known if topic not in produced and not topic.startswith("warploom/")
         ]
+        reached = [last - first for topic in played for first, last in [versions[topic]]]
+        if seek and reached and max(reached) < seek * 1e9:
+            raise ConfigError(
+                f"{path}: --seek {seek:g} is beyond its end, {max(reached) / 1e9:.1f} s after its beginning"
+            )
         drain = Drain(process, played) if process is not None else None
         recorder = None
         if record is not None:

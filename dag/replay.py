@@ -50,9 +50,11 @@ class ReplayResult:
     """Commits that are not."""
     differences: list[Difference] = field(default_factory=list)
     """The first hundred of them."""
+    other_fields: tuple[str, ...] = ()
+    """Topics whose messages have other fields than when the recording was made: what was recorded is compared as it is
+    encoded today, with the defaults of fields that are new."""
     broken: str | None = None
     """Where the recording broke off."""
-
     hung: str | None = None
     """Which frame did not get through, so that the replay ended there."""
 
@@ -86,9 +88,13 @@ class Replay:
         made: list[tuple[str, int, int, bytes]] = []
         logged: list[RecordedEvent] = []
         sources: dict[str, tuple[int, bool]] = {}
+        changed: dict[str, bool] = {}
         for event in recording:
+            if event.kind is EventKind.COMMIT and event.payload is not None and event.topic not in changed:
+                changed[event.topic] = _digest_today(event) != event.sha256
             if event.kind is EventKind.COMMIT and event.topic in produced:
-                made.append((event.topic, event.epoch, event.version, event.sha256))
+                sha256 = _digest_today(event) if changed.get(event.topic) else event.sha256
+                made.append((event.topic, event.epoch, event.version, sha256))
             elif event.kind is EventKind.LOG:
                 logged.append(event)
             elif event.kind is EventKind.COMMIT:
@@ -116,7 +122,7 @@ class Replay:
         self._newest = {topic: max(commits) for topic, commits in self._expected.items()}
         self._beyond: list[Difference] = []
         self._fed: set[tuple[int, int]] = set()
-        self._result = ReplayResult()
+        self._result = ReplayResult(other_fields=tuple(sorted(topic for topic, other in changed.items() if other)))
         self._lock = threading.Lock()
 
     def run(self) -> ReplayResult:
@@ -181,6 +187,14 @@ class Replay:
         self._result.different += 1
         if len(self._result.differences) < _SHOWN:
             self._result.differences.append(difference)
+
+
+def _digest_today(event: RecordedEvent) -> bytes:
+    """Of the payload as it would be recorded today; as it was where it cannot be decoded."""
+    try:
+        return digest(encode(event.value))
+    except (ValueError, LookupError):
+        return event.sha256
 
 
 class Drain:

@@ -1,11 +1,14 @@
 """Replay: the same components give the same bytes on any number of workers, and others are found out."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from warploom.dag import In, Out, Process, Processor, ProcessorConfig, Status, load_module
 from warploom.dag.replay import Difference, Drain, Replay, produced_topics
 from warploom.datamesh import CommitPolicy, Output
+from warploom.datamesh.messages import message
 from warploom.datamesh.playback import Player
 from warploom.datamesh.recording import Recorder
 from warploom.datamesh.recording_reader import Recording
@@ -278,3 +281,48 @@ def test_triggers_of_several_inputs_replay_and_drain(write, tmp_path):
     process.stop()
     assert drained == [True]
     assert not process.mesh.losses["made/either", "out_of_order"]
+
+
+def reading(*fields):
+    """A message as one version of a program defines it."""
+    made = dataclasses.make_dataclass("Reading", [("total", float), *fields], frozen=True)
+    return message("warploom_tests.Reading")(made)
+
+
+class Reads(Processor):
+    message = reading()
+    value: In[np.ndarray]
+    reading: Out[object]
+
+    def process(self, trigger):
+        self.reading.value = self.message(float(self.value.value.sum()))
+        return Status.OK
+
+
+READS = f"""\
+module: reads
+components:
+  - name: reads
+    kind: dag
+    trigger: value
+    inputs: {{value: sensor/value}}
+    outputs: {{reading: made/reading}}
+    graph:
+      read: {{processor: {__name__}.Reads}}
+      commit: {{processor: warploom.dag.CommitDagProcessor, in: {{value: reading}}, config: {{output: reading}}}}
+"""
+
+
+def test_a_message_that_has_got_a_field_since_is_told_and_compared_with_that_field(write, tmp_path, monkeypatch):
+    recording = record(tmp_path / "a.mcap", process_of(write, READS))
+    result = Replay(recording, process_of(write, READS)).run()
+    assert (result.good, result.other_fields) == (True, ())
+    monkeypatch.setattr(Reads, "message", reading(("unit", str, dataclasses.field(default="m"))))
+    result = Replay(recording, process_of(write, READS)).run()
+    assert result.other_fields == ("made/reading",)
+    assert result.good, result.differences
+    assert result.equal == {"made/reading": 40}
+    # Another value of the new field is a difference, as another default would be.
+    today = Reads.message
+    monkeypatch.setattr(Reads, "message", lambda _, total: today(total, "ft"))
+    assert Replay(recording, process_of(write, READS)).run().different == 40
