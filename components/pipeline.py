@@ -213,6 +213,7 @@ class Pipeline:
             external={LIDAR_TOPIC: SensorFrame, CAMERAS_TOPIC: CameraSet, RADARS_TOPIC: RadarSet},
             offline=offline,
             on_timing=self._record,
+            switch_interval_s=self.profile.threads.switch_interval_s,
             check=self.profile.check,
         )
 

@@ -55,6 +55,13 @@ class ThreadsSpec(_Spec):
     """Of a detection head on a CPU."""
     kernels: int | None = Field(None, ge=1, le=64)
     """Of a kernel on a CPU; left out: $WARPLOOM_THREADS, or the cores of the process, at most 8."""
+    switch_ms: float | None = Field(0.1, gt=0.0, le=1000.0)
+    """How long a thread that computes in Python keeps the others waiting while components run [ms]; null: as it is."""
+
+    @property
+    def switch_interval_s(self) -> float | None:
+        """The same [s], as `Process` takes it."""
+        return None if self.switch_ms is None else self.switch_ms / 1000.0
 
 
 class LidarSpec(_Spec):

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from warploom.components import pipeline
 from warploom.components import profile as profiles
 from warploom.components.profile import (
     CONF,
@@ -52,6 +53,7 @@ def written(tmp_path, text):
         ("backends: {ground: taichi:cdua}", 3, "ground: no backend 'taichi:cdua'; did you mean 'taichi:cuda'?"),
         ("threads: {kernels: 0}", 3, "threads.kernels: Input should be greater than or equal to 1"),
         ("threads: {kernel: 2}", 3, "threads.kernel: unknown key; did you mean 'kernels'?"),
+        ("threads: {switch_ms: 0}", 3, "threads.switch_ms: Input should be greater than 0"),
         ("sensors:\n  lidar: [top]\n  camera: [top]", 3, "two sensors are called 'top'"),
         ("sensors:\n  lidar:\n    - {name: top, modl: vlp16}", 5, "modl: unknown key; did you mean 'model'?"),
         ("sensors:\n  lidar: [9top]", 4, "String should match pattern"),
@@ -95,6 +97,16 @@ sensors:
     assert context.sensors["front"] == SensorSpec(name="front")
     assert file.content.sensor_names == {"lidar": ["roof"], "camera": ["front", "rear"]}
     assert execution_context(file, "cpu").precision == "fp32", "on a CPU there is no other"
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("", 1e-4), ("threads: {switch_ms: 2}", 2e-3), ("threads: {switch_ms: null}", None)]
+)
+def test_how_soon_python_switches_threads_reaches_the_process(tmp_path, monkeypatch, text, seconds):
+    given = []
+    monkeypatch.setattr(pipeline, "Process", lambda *_, switch_interval_s, **__: given.append(switch_interval_s))
+    pipeline.Pipeline.from_profile(str(written(tmp_path, text)))
+    assert given == [seconds if seconds is None else pytest.approx(seconds)]
 
 
 def test_a_height_that_is_said_goes_before_the_mounting(tmp_path):
