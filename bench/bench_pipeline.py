@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from warploom.bench.contest import record_figure
 from warploom.bench.long_run import cycled
 from warploom.bench.scans import REAL
 from warploom.components.pipeline import Pipeline
+from warploom.components.sources import open_source
 from warploom.errors import ConfigError, ModelError
 
 FRAMES = 60
+TURNING = "street, turning"
 LONG_RUN = 1000
 
 
@@ -30,9 +33,9 @@ def pipeline():
         yield made
 
 
-@pytest.mark.parametrize("scan", ["street", REAL])
+@pytest.mark.parametrize("scan", ["street", TURNING, REAL])
 def bench_frame(benchmark, contest, pipeline, scan):
-    """Frame after frame through the profile `cpu`, head included, one at a time."""
+    """Frame after frame through the profile `cpu`, head included, one at a time; of sweeps that turn, motion undone."""
     taken = some_frames(benchmark, contest, pipeline, scan)
     total = [frame.latency.total_ms for frame in taken]
     points = np.median([len(frame.points) for frame in taken])
@@ -60,8 +63,17 @@ def bench_frame_in_taichi(benchmark, contest):
 
 def some_frames(benchmark, contest, pipeline, scan):
     """Times frames one at a time, after a few that are not counted."""
-    scans = [frame.points for frame in contest.scans.street] if scan == "street" else [contest.cloud(scan)]
-    frames = pipeline.run(cycled(scans, FRAMES + 10))
+    if scan == TURNING:
+        drive = [replace(frame, truth=None) for frame in open_source("sim:street?seed=7&duration=2&sensors=lidar")]
+        scans = [frame.points for frame in drive]
+        source = (
+            replace(drive[k % len(drive)], version=frame.version, index=frame.index, continues=k % len(drive) > 0)
+            for k, frame in enumerate(cycled(scans, FRAMES + 10))
+        )
+    else:
+        scans = [frame.points for frame in contest.scans.street] if scan == "street" else [contest.cloud(scan)]
+        source = cycled(scans, FRAMES + 10)
+    frames = pipeline.run(source)
     taken = []
     benchmark.extra_info.update(kernel="frame", on=scan)
     benchmark.pedantic(lambda: taken.append(next(frames)), rounds=FRAMES, warmup_rounds=10)

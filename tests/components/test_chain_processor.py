@@ -14,7 +14,7 @@ SETTINGS = {"radius": 0.6, "min_size": 5, "max_height": 3.0}
 
 @pytest.fixture(scope="module")
 def frames():
-    return list(wl.read("sim:street?seed=4&duration=0.3"))
+    return list(wl.read("sim:street?seed=4&duration=0.3&turning=1"))
 
 
 @pytest.mark.parametrize("captured", [False, True])
@@ -51,7 +51,7 @@ def test_it_gives_what_the_single_stages_give(frames, captured, capacity):
 def test_a_frame_without_points(frames):
     import dataclasses
 
-    frame = dataclasses.replace(frames[0], points=np.zeros((0, 4), np.float32))
+    frame = dataclasses.replace(frames[0], points=np.zeros((0, 4), np.float32), t=np.zeros(0, np.float32))
     found = ProcessorHarness(ChainProcessor, {}, ExecutionContext(capacity=1000)).feed(sensor=frame).run(0)
     assert found["clusters"].count == len(found["filtered"].xyz) == 0
 
@@ -75,3 +75,29 @@ def test_the_profile_gives_the_same_objects(frames):
     assert objects[0][-1]
     for ours, theirs in zip(*objects, strict=True):
         assert repr(ours) == repr(theirs)
+
+
+@pytest.mark.parametrize("captured", [False, True])
+def test_motion_is_undone_where_times_and_poses_are_known_and_only_there(frames, captured):
+    """Frame after frame in one chain: a turning sweep, one in an instant, one without poses, one that is not to be."""
+    import dataclasses
+
+    context = ExecutionContext(capacity=150_000)
+    chain = ProcessorHarness(ChainProcessor, {"captured": captured}, context)
+    single = ProcessorHarness(FilterProcessor, {}, context)
+    left = [
+        ProcessorHarness(kind, {"motion_compensation": False}, context) for kind in (ChainProcessor, FilterProcessor)
+    ]
+    sensor = frames[0]
+    instant = dataclasses.replace(sensor, t=np.zeros_like(sensor.t), poses=None, pose_times=None)
+    bare = dataclasses.replace(sensor, poses=None, pose_times=None)
+    seen = wl.compensate_motion(sensor.points, sensor.t, sensor.poses, sensor.pose_times, 0.0)
+    for frame, harnesses, moved in (
+        (sensor, (chain, single), True), (instant, (chain, single), False), (sensor, (chain, single), True),
+        (bare, (chain, single), False), (sensor, left, False),
+    ):  # fmt: skip
+        for harness in harnesses:
+            filtered = harness.feed(sensor=frame).run(frame.version)["filtered"]
+            assert filtered.compensated is moved
+            expected = (seen if moved else sensor.points)[filtered.index.numpy(), :3]
+            assert filtered.xyz.numpy().tobytes() == expected.tobytes()

@@ -29,7 +29,7 @@ CONTEXT = ExecutionContext(capacity=150_000)
 
 @pytest.fixture(scope="module")
 def sensor() -> SensorFrame:
-    return next(iter(wl.read("sim:street?seed=2&duration=0.1")))
+    return next(iter(wl.read("sim:street?seed=2&duration=0.1&turning=1")))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,10 @@ def test_the_filter_keeps_points_in_order_and_counts_the_rest(stages, sensor):
     filtered = stages["filtered"]
     index = filtered.index.numpy()
     assert (np.diff(index) > 0).all()
-    assert np.array_equal(filtered.xyz.numpy(), sensor.points[index, :3])
+    seen = wl.compensate_motion(sensor.points, sensor.t, sensor.poses, sensor.pose_times, 0.0)
+    assert filtered.compensated
+    assert np.array_equal(filtered.xyz.numpy(), seen[index, :3])
+    assert not np.array_equal(filtered.xyz.numpy(), sensor.points[index, :3])
     assert len(index) + sum(filtered.dropped.values()) == len(sensor.points)
 
 
