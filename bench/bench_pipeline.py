@@ -64,7 +64,8 @@ def bench_frame_in_taichi(benchmark, contest):
 def some_frames(benchmark, contest, pipeline, scan):
     """Times frames one at a time, after a few that are not counted."""
     if scan == TURNING:
-        drive = [replace(frame, truth=None) for frame in open_source("sim:street?seed=7&duration=2&sensors=lidar")]
+        street = open_source("sim:street?seed=7&duration=2&turning=1&sensors=lidar")
+        drive = [replace(frame, truth=None) for frame in street]
         scans = [frame.points for frame in drive]
         source = (
             replace(drive[k % len(drive)], version=frame.version, index=frame.index, continues=k % len(drive) > 0)
