@@ -18,7 +18,8 @@ from .backend import uses_taichi
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
 from .cell_table import CellTable, cell_at
-from .cluster_columns import JoinedColumns, label_points
+from .cluster_columns import JoinedColumns
+from .cluster_labels import label_points
 from .cluster_levels import join_levels_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
@@ -141,7 +142,7 @@ class EuclideanCluster:
         forward = [d for d in np.ndindex(5, 5, 5) if d > (2, 2, 2)]
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         if sequential:
-            by_cell = CellColumns(self._radius, self.capacity)
+            by_cell = CellColumns(self._radius, self.capacity, ordered=False)
             keep("_by_cell", by_cell)
             columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
             joined = JoinedColumns(by_cell, *columns, self._radius)

@@ -1,39 +1,125 @@
 """Clustering on a CPU: columns of cells, joined with their neighbours. `cluster.py` has the plan.
 
+Cells on top of each other whose first points are near make a segment. Segments stand in order of x, y and z, so those
+that may touch one lie in three stretches: of its own row of columns, of the next, and of the one after that. Their
+boxes are compared with its own eight at a time, without a branch, and so are then the points of those that are of
+another component still and near enough.
+
 Each part of the work joins the cells of its own columns, in a forest that no other part reads; one thread then joins
 the columns at the borders between the parts, which are few.
-
-Of most cells that touch the first points are near already. Those are therefore looked at beforehand, without a branch:
-of cells on top of each other, and of the lowest of each run of cells side by side. That need not find all. Only where
-components still differ are cells tried in earnest, first those that share a corner, then those that are two apart. The
-heights of a column's cells are the bits of a mask, so that cells side by side are found in one step.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from .cell_columns import CellColumns, Layout
+from .cell_columns import CellColumns
 from .cell_pairs import TOUCH, Radius
-from .column_neighbors import FORWARD, LIST_NEIGHBORS, map_places
+from .column_neighbors import NEAR_COLUMNS
 from .device import DEFAULT_DEVICE
 from .threads import PackedLaunch
 
-__all__ = ["JoinedColumns", "label_points"]
+__all__ = ["JoinedColumns"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-# `a` and `b` are cells, `k` and `other` columns.
-_JOIN = (
-    TOUCH
+_LANES = 8  # read beyond the end of what is compared eight at a time
+
+# `s` and `t` are segments, `k` is a column.
+_JOIN_OWN = (
+    "#ifndef __CUDA_ARCH__  // for CPUs alone"
+    + TOUCH
+    + NEAR_COLUMNS
     + """
+    constexpr int LANES = 8, MOST_TESTS = 1024;  // of eight pairs, until crowds are narrowed to what lies between them
+    typedef float Eight __attribute__((ext_vector_type(8)));
+    typedef int EightOf __attribute__((ext_vector_type(8)));
+    typedef bool EightBits __attribute__((ext_vector_type(8)));
+    typedef const float* __restrict Lanes;
+    const auto eight = [](const float* from) {
+        Eight loaded;
+        memcpy(&loaded, from, sizeof(loaded));
+        return loaded;
+    };
+    const auto eight_of = [](const int* from) {
+        EightOf loaded;
+        memcpy(&loaded, from, sizeof(loaded));
+        return loaded;
+    };
+    const auto bits_of = [](const EightOf answers) {
+        return (unsigned)__builtin_bit_cast(unsigned char, __builtin_convertvector(answers, EightBits));
+    };
+    const auto squared_gap = [](const Eight over, const Eight under) {
+        const Eight gap = __builtin_elementwise_max(__builtin_elementwise_max(over, under), (Eight)0.0f);
+        return gap * gap;
+    };
     const vec4i* __restrict column = columns.data;
     const vec2i* __restrict stack = stacks.data;
-    int* __restrict above = parent.data;
-    const auto height = [&](const int cell) { return stack[cell][0]; };
-    const auto find = [&](const int cell) {
-        int root = cell;
+    const vec3* __restrict point = points.data;
+    int* __restrict above = segment_parent.data;
+    int* __restrict cell_of = segment_cell.data;
+    int* __restrict start_of = segment_start.data;
+    int* __restrict segment_of = first_segment.data + part;  // each part has one more than columns
+    const auto lanes_of = [](const wp::array_t<float>& lanes, const int row) {
+        return lanes.data + (long long)row * lanes.shape[1];
+    };
+    const Lanes low[3] = {lanes_of(boxes, 0), lanes_of(boxes, 1), lanes_of(boxes, 2)};
+    const Lanes high[3] = {lanes_of(boxes, 3), lanes_of(boxes, 4), lanes_of(boxes, 5)};
+    const Lanes along[3] = {lanes_of(coordinates, 0), lanes_of(coordinates, 1), lanes_of(coordinates, 2)};
+    const auto first_bits = [](const int count) { return count >= LANES ? (1u << LANES) - 1 : (1u << count) - 1; };
+    const auto lowest = [](const unsigned bits) { return __builtin_ctz(bits); };
+
+    // Cells on top of each other make segments.
+    int segments = first_cell - 1;
+    for (int k = begin; k < end; ++k) {
+        segment_of[k] = segments + 1;
+        int z = stack[column[k][2]][0], before = stack[column[k][2]][1];
+        cell_of[++segments] = column[k][2];
+        for (int c = column[k][2] + 1; c < column[k][3]; ++c) {
+            const int first = stack[c][1];
+            const vec3 &p = point[first], &q = point[before];
+            const float dx = p[0] - q[0], dy = p[1] - q[1], dz = p[2] - q[2];
+            const bool linked = (stack[c][0] == z + 1) & (dx * dx + dy * dy + dz * dz <= radius.surely);
+            segments += !linked;
+            cell_of[segments] = linked ? cell_of[segments] : c;
+            z = stack[c][0];
+            before = first;
+        }
+    }
+    segment_of[end] = ++segments;
+    cell_of[segments] = last_cell;
+    for (int s = first_cell; s < segments; ++s) {
+        const int first = stack[cell_of[s]][1], last = stack[cell_of[s + 1]][1];
+        start_of[s] = first;
+        above[s] = s;
+        vec3 least = point[first], most = least;
+        for (int i = first; i < last; ++i) {
+            for (int axis = 0; axis < 3; ++axis) {
+                const float here = point[i][axis];
+                lanes_of(coordinates, axis)[i] = here;
+                least[axis] = here < least[axis] ? here : least[axis];
+                most[axis] = here > most[axis] ? here : most[axis];
+            }
+        }
+        for (int axis = 0; axis < 3; ++axis) {
+            lanes_of(boxes, axis)[s] = least[axis];
+            lanes_of(boxes, axis + 3)[s] = most[axis];
+        }
+    }
+    start_of[segments] = stack[last_cell][1];
+
+    float surely = radius.surely, surely_not = radius.surely_not;
+    const auto set_level = [&](const int level) {
+        const long long bits[2] = {(level + (1023ll << 3)) << 49, (level + 1 + (1023ll << 3)) << 49};
+        double growth[2];
+        memcpy(growth, bits, 16);
+        const double least = growth[0] * radius.at_origin, most = growth[1] * radius.at_origin;
+        surely = (float)wp::min(least * least * (1.0 - 1e-6), 3.0e38);
+        surely_not = (float)(most * most * (1.0 + 1e-6));
+    };
+    const auto find = [&](const int s) {
+        int root = s;
         for (int next = above[root]; next != root; next = above[root]) {
             const int after = above[next];
             above[root] = after;
@@ -41,204 +127,105 @@ _JOIN = (
         }
         return root;
     };
-    const auto cells_touch = [&](const int a, const int b) {
-        return touch(stack[a][1], stack[a + 1][1], stack[b][1], stack[b + 1][1]);
+    // Of the eight segments from `t` which are near enough and not known to be of the same component.
+    const auto near_segments = [&](const int s, const int t) {
+        Eight sum = 0.0f;
+        for (int axis = 0; axis < 3; ++axis)
+            sum += squared_gap(eight(low[axis] + t) - high[axis][s], low[axis][s] - eight(high[axis] + t));
+        return bits_of((sum <= surely_not) & (eight_of(above + t) != above[s]));
     };
-    const auto hang = [&](const int root, const int other) {
-        const bool swapped = other < root;
-        above[swapped ? root : other] = swapped ? other : root;
+    // Of the eight points from `i` which are near a segment's box.
+    const auto near_box = [&](const int i, const int t) {
+        Eight sum = 0.0f;
+        for (int axis = 0; axis < 3; ++axis) {
+            const Eight here = eight(along[axis] + i);
+            sum += squared_gap(low[axis][t] - here, here - high[axis][t]);
+        }
+        return bits_of(sum <= surely_not);
     };
-    // All cells of two columns, or of one, that touch; of any height.
-    const auto join_columns = [&](const int k, const int other) __attribute__((noinline)) {
-        int low = column[other][2];
-        const int end = column[other][3];
-        for (int a = column[k][2]; a < column[k][3]; ++a) {
-            if (k == other) low = a + 1;
-            const long long z = height(a);
-            while (low < end && height(low) < z - 2) ++low;
-            for (int b = low; b < end && height(b) <= z + 2; ++b) {
-                const int root = find(a), other_root = find(b);
-                if (root != other_root && cells_touch(a, b)) hang(root, other_root);
+    const auto squared_distances = [&](const int i, const vec3& p) {
+        const Eight x = p[0] - eight(along[0] + i), y = p[1] - eight(along[1] + i), z = p[2] - eight(along[2] + i);
+        return x * x + y * y + z * z;
+    };
+    const auto segments_touch = [&](const int s, const int t) __attribute__((noinline)) {
+        const int s_end = start_of[s + 1], t_begin = start_of[t], t_end = start_of[t + 1];
+        int tests = 0;
+        for (int i = start_of[s]; i < s_end; i += LANES) {
+            for (unsigned near = near_box(i, t) & first_bits(s_end - i); near != 0; near &= near - 1) {
+                const vec3& p = point[i + lowest(near)];
+                for (int j = t_begin; j < t_end; j += LANES) {
+                    const unsigned own = first_bits(t_end - j);
+                    const Eight squared = squared_distances(j, p);
+                    if ((bits_of(squared <= surely) & own) != 0) return true;
+                    for (unsigned maybe = bits_of(squared <= surely_not) & own; maybe != 0; maybe &= maybe - 1)
+                        if (are_near(p, point[j + lowest(maybe)], surely, surely_not)) return true;
+                    if (++tests > MOST_TESTS) return touch(start_of[s], s_end, t_begin, t_end);
+                }
             }
         }
+        return false;
     };
-"""
-)
+    const auto join = [&](const int s, const int t) {
+        const int root = find(s), other = find(t);
+        if (root != other && segments_touch(s, t)) above[wp::max(root, other)] = wp::min(root, other);
+    };
 
-
-@wp.func_native(
-    _JOIN
-    + LIST_NEIGHBORS
-    + """
-    typedef unsigned long long Mask;
-    constexpr int MOST_HEIGHTS = 60;  // of a mask, which has two free on either side
-    int* __restrict around = neighbors.data;
-    int* __restrict root_of = column_root.data;
-    const Mask* __restrict mask_of = (const Mask*)masks.data;
-    const vec3* __restrict point = points.data;
-    #ifdef __CUDA_ARCH__
-    const auto popcount = [](const Mask mask) { return __popcll(mask); };
-    #else
-    const auto popcount = [](const Mask mask) { return (int)__builtin_popcountll(mask); };
+    // A segment and those after it: up to eight of each row at once.
+    NearColumns own_row{column, end, 0, 2, begin, begin};
+    NearColumns next_row{column, end, 1, 2, begin, begin}, second_row{column, end, 2, 2, begin, begin};
+    for (int k = begin; k < end; ++k) {
+        own_row.move_to(k);
+        next_row.move_to(k);
+        second_row.move_to(k);
+        int from[3] = {0, segment_of[next_row.first], segment_of[second_row.first]};
+        const int to[3] = {segment_of[own_row.last], segment_of[next_row.last], segment_of[second_row.last]};
+        if (grows) set_level((column[k][0] + (1 << 18)) >> 19);
+        for (int s = segment_of[k]; s < segment_of[k + 1]; ++s) {
+            from[0] = s + 1;
+            unsigned near = 0;
+            bool more = false;
+            for (int row = 0; row < 3; ++row) {
+                near |= (near_segments(s, from[row]) & first_bits(to[row] - from[row])) << LANES * row;
+                more |= to[row] - from[row] > LANES;
+            }
+            for (; near != 0; near &= near - 1) {
+                const int bit = lowest(near);
+                join(s, from[bit / LANES] + bit % LANES);
+            }
+            if (!more) continue;
+            for (int row = 0; row < 3; ++row) {
+                for (int t = from[row] + LANES; t < to[row]; t += LANES)
+                    for (near = near_segments(s, t) & first_bits(to[row] - t); near != 0; near &= near - 1)
+                        join(s, t + lowest(near));
+            }
+        }
+    }
+    for (int s = first_cell; s < segments; ++s) {
+        above[s] = above[above[s]];  // a lower segment's is its root by now
+        for (int c = cell_of[s]; c < cell_of[s + 1]; ++c) parent.data[c] = cell_of[above[s]];
+    }
     #endif
-    const auto below = [](const Mask bit) { return bit - 1; };
-    const auto lowest = [](const Mask mask) { return mask & (~mask + 1); };
-    const auto bottom = [&](const int k) { return height(column[k][2]); };
-    // A mask of one column as the other's, whose bottom is higher by so much.
-    const auto moved = [](const Mask mask, const int by) {
-        const Mask down = mask >> (by & 63), up = mask << (-by & 63);
-        return by > 63 || by < -63 ? 0 : (by >= 0 ? down : up);
-    };
-    const auto spread = [](const Mask mask, const int reach) {
-        const Mask by_one = mask | mask << 1 | mask >> 1;
-        return reach == 1 ? by_one : by_one | mask << 2 | mask >> 2;
-    };
-    const auto first_points_touch = [&](const int a, const int b) {
-        const vec3 &p = point[stack[a][1]], &q = point[stack[b][1]];
-        const float x = p[0] - q[0], y = p[1] - q[1], z = p[2] - q[2];
-        return x * x + y * y + z * z <= radius.surely;
-    };
-
-    // Cells on top of each other.
-    for (int k = begin; k < end; ++k) {
-        const int first = column[k][2], last = column[k][3];
-        const int base = height(first);
-        int z = base;
-        Mask mask = 4;
-        above[first] = first;
-        for (int a = first + 1; a < last; ++a) {
-            const int here = height(a);
-            const bool joined = (here == z + 1) & first_points_touch(a - 1, a);
-            above[a] = joined ? above[a - 1] : a;
-            z = here;
-            mask |= (Mask)4 << ((z - base) & 63);
-        }
-        masks.data[k] = (long long)z - base < MOST_HEIGHTS ? mask : 0;
-    }
-    list_neighbors(begin, end, around);
-
-    // Cells side by side.
-    constexpr int BLOCK = 256;
-    int pair[BLOCK + 32][2], pairs = 0;
-    const auto unite_pairs = [&]() __attribute__((noinline)) {
-        for (int i = 0; i < pairs; ++i) {
-            const int a = find(pair[i][0]), b = find(pair[i][1]);
-            above[a < b ? b : a] = a < b ? a : b;
-        }
-        pairs = 0;
-    };
-    for (int k = begin; k < end; ++k) {
-        for (int o = 0; o < 2; ++o) {
-            const int other = around[12ll * k + o];
-            if (other < 0) continue;
-            const Mask here = mask_of[k], there = mask_of[other];
-            const int apart = bottom(k) - bottom(other);
-            const Mask both = here & moved(there, apart);
-            for (Mask left = both & ~(both << 1); left != 0; left &= left - 1) {
-                const Mask bit = lowest(left);
-                const int a = column[k][2] + popcount(here & below(bit));
-                const int b = column[other][2] + popcount(there & below(moved(bit, -apart)));
-                pair[pairs][0] = a;
-                pair[pairs][1] = b;
-                pairs += first_points_touch(a, b);
-            }
-            if (pairs >= BLOCK) unite_pairs();
-        }
-    }
-    unite_pairs();
-
-    // Stretches of a column's cells that are of one component; columns that are one whole.
-    int* __restrict first_segment = first_segments.data + part;  // each part has one more than columns
-    Mask* __restrict segment_mask = (Mask*)segment_masks.data;
-    int* __restrict segment_root = segment_roots.data;
-    const auto find_segments = [&]() {
-        for (int c = first_cell; c < last_cell; ++c) above[c] = above[above[c]];  // a lower cell's is its root by now
-        int segment = first_cell;
-        for (int k = begin; k < end; ++k) {
-            const int first = segment;
-            first_segment[k] = first;
-            Mask left = mask_of[k], mask = 0;
-            int root = above[column[k][2]];
-            for (int a = column[k][2]; a < column[k][3]; ++a) {
-                if (above[a] != root) {
-                    segment_mask[segment] = mask;
-                    segment_root[segment++] = root;
-                    root = above[a];
-                    mask = 0;
-                }
-                mask |= lowest(left);
-                left &= left - 1;
-            }
-            segment_mask[segment] = mask;
-            segment_root[segment++] = root;
-            root_of[k] = segment == first + 1 ? root : -1;
-        }
-        first_segment[end] = segment;
-    };
-    const auto join = [&](const int k, const int other, const int reach) __attribute__((noinline)) {
-        const Mask here = mask_of[k], there = mask_of[other];
-        if (here == 0 || there == 0) {
-            join_columns(k, other);
-            return;
-        }
-        const int apart = bottom(k) - bottom(other);
-        if ((spread(here, reach) & moved(there, apart)) == 0) return;
-        for (int s = first_segment[k]; s < first_segment[k + 1]; ++s) {
-            const Mask own = segment_mask[s], near = spread(own, reach);
-            for (int t = k == other ? s + 1 : first_segment[other]; t < first_segment[other + 1]; ++t) {
-                if ((near & moved(segment_mask[t], apart)) == 0 || segment_root[s] == segment_root[t]) continue;
-                const int root = find(segment_root[s]), other_root = find(segment_root[t]);
-                if (root == other_root) continue;
-                bool touched = false;
-                for (int step = 0; step <= 2 * reach && !touched; ++step) {
-                    // Heights that differ by 0, 1, −1, 2, −2.
-                    const int by = apart + (step & 1 ? (step + 1) / 2 : -step / 2);
-                    for (Mask left = own & moved(segment_mask[t], by); left != 0 && !touched; left &= left - 1) {
-                        const Mask bit = lowest(left);
-                        const int a = column[k][2] + popcount(here & below(bit));
-                        const int b = column[other][2] + popcount(there & below(moved(bit, -by)));
-                        touched = cells_touch(a, b);
-                    }
-                }
-                if (touched) hang(root, other_root);
-            }
-        }
-    };
-    for (int reach = 1; reach < 3; ++reach) {
-        find_segments();
-        for (int k = begin; k < end; ++k) {
-            const int own = root_of[k];
-            if (own < 0 && reach == 1) join(k, k, 2);
-            int differ = 0;
-            for (int o = 0; o < (reach == 1 ? 4 : 12); ++o) {
-                const int other = around[12ll * k + o];
-                const int root = root_of[other < 0 ? k : other];
-                differ |= (int)((other >= 0) & ((root != own) | (own < 0))) << o;
-            }
-            for (; differ != 0; differ &= differ - 1)
-                join(k, around[12ll * k + popcount(below(differ & -differ))], reach);
-        }
-    }
 """
 )
+
+
+@wp.func_native(_JOIN_OWN)
 def _join_own(
     part: int,
     first_cell: int,
     last_cell: int,
     begin: int,
     end: int,
-    layout: Layout,
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
     radius: Radius,
-    column_map: wp.array(dtype=wp.int32),
-    neighbors: wp.array(dtype=wp.int32),
-    masks: wp.array(dtype=wp.uint64),
-    column_root: wp.array(dtype=wp.int32),
-    first_segments: wp.array(dtype=wp.int32),
-    segment_masks: wp.array(dtype=wp.uint64),
-    segment_roots: wp.array(dtype=wp.int32),
+    first_segment: wp.array(dtype=wp.int32),
+    segment_cell: wp.array(dtype=wp.int32),
+    segment_start: wp.array(dtype=wp.int32),
+    segment_parent: wp.array(dtype=wp.int32),
+    boxes: wp.array2d(dtype=wp.float32),
+    coordinates: wp.array2d(dtype=wp.float32),
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites cells of the columns begin … end − 1."""
@@ -249,52 +236,58 @@ def join_own_columns(
     part: int,
     parts: int,
     # in
-    layout_in: wp.array(dtype=Layout),
     ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
     radius: Radius,
-    # in out: a map of columns, -1 where there is none, and left so
-    column_map: wp.array(dtype=wp.int32),
-    # out: of each column its neighbours, its cells' heights as a mask, 0 where it is not wide enough, and its root, or
-    # -1; stretches of its cells of one root
-    neighbors: wp.array(dtype=wp.int32),
-    masks: wp.array(dtype=wp.uint64),
-    column_root: wp.array(dtype=wp.int32),
-    first_segments: wp.array(dtype=wp.int32),
-    segment_masks: wp.array(dtype=wp.uint64),
-    segment_roots: wp.array(dtype=wp.int32),
+    # out: of each column its first segment; of each segment its first cell and point, one of its component, the lowest
+    # x, y, z and the highest; the points' x, y and z
+    first_segment: wp.array(dtype=wp.int32),
+    segment_cell: wp.array(dtype=wp.int32),
+    segment_start: wp.array(dtype=wp.int32),
+    segment_parent: wp.array(dtype=wp.int32),
+    boxes: wp.array2d(dtype=wp.float32),
+    coordinates: wp.array2d(dtype=wp.float32),
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites the cells of a part that touch."""
     own = ranges[part]
     if own[2] < own[3]:
         _join_own(
-            part,
-            own[0],
-            own[1],
-            own[2],
-            own[3],
-            layout_in[0],
-            columns,
-            stacks,
-            points,
-            radius,
-            column_map,
-            neighbors,
-            masks,
-            column_root,
-            first_segments,
-            segment_masks,
-            segment_roots,
-            parent,
-        )
+            part, own[0], own[1], own[2], own[3], columns, stacks, points, radius,
+            first_segment, segment_cell, segment_start, segment_parent, boxes, coordinates, parent,
+        )  # fmt: skip
 
 
 @wp.func_native(
-    _JOIN
+    TOUCH
     + """
+    const vec4i* __restrict column = columns.data;
+    const vec2i* __restrict stack = stacks.data;
+    int* __restrict above = parent.data;
+    const auto find = [&](const int cell) {
+        int root = cell;
+        for (int next = above[root]; next != root; next = above[root]) {
+            const int after = above[next];
+            above[root] = after;
+            root = after;
+        }
+        return root;
+    };
+    const auto join_columns = [&](const int k, const int other) {
+        int low = column[other][2];
+        const int end = column[other][3];
+        for (int a = column[k][2]; a < column[k][3]; ++a) {
+            const long long z = stack[a][0];
+            while (low < end && stack[low][0] < z - 2) ++low;
+            for (int b = low; b < end && stack[b][0] <= z + 2; ++b) {
+                const int root = find(a), other_root = find(b);
+                if (root != other_root && touch(stack[a][1], stack[a + 1][1], stack[b][1], stack[b + 1][1]))
+                    above[wp::max(root, other_root)] = wp::min(root, other_root);
+            }
+        }
+    };
     const int parts = ranges.shape[0];
     const auto is_before = [&](const int k, const int x, const int y) {
         return column[k][0] < x || (column[k][0] == x && column[k][1] < y);
@@ -345,71 +338,6 @@ def join_borders(
     _join_parts(ranges, columns, stacks, points, radius, parent)
 
 
-@wp.func_native("""
-    constexpr int UNNUMBERED = -2;
-    int* __restrict root_of = parent.data;
-    int* __restrict label_of = members.data;
-    const wp::vec2i* __restrict stack = stacks.data;
-    const int parts = ranges.shape[0];
-    for (int p = 0; p < parts; ++p) {
-        for (int c = ranges.data[p][0]; c < ranges.data[p][1]; ++c) {
-            const int root = root_of[root_of[c]];  // a lower cell's parent is its root by now
-            root_of[c] = root;
-            label_of[root] = (root == c ? 0 : label_of[root]) + stack[c + 1][1] - stack[c][1];
-        }
-    }
-    // Of a root nothing but its label is wanted from here on.
-    for (int p = 0; p < parts; ++p)
-        for (int c = ranges.data[p][0]; c < ranges.data[p][1]; ++c)
-            if (root_of[c] == c) label_of[c] = label_of[c] >= min_size ? UNNUMBERED : -1;
-    int clusters = 0;
-    const int points = point_count.data[0];
-    const int* __restrict cell_of = cell_of_point.data;
-    int* __restrict label_out = labels_out.data;
-    for (int i = 0; i < points; ++i) {
-        const int cell = cell_of[i];
-        int label = -1;
-        if (cell >= 0) {
-            label = label_of[root_of[cell]];
-            if (label == UNNUMBERED) label = label_of[root_of[cell]] = clusters++;
-        }
-        label_out[i] = label;
-    }
-    cluster_count_out.data[0] = clusters;
-""")
-def _label(
-    ranges: wp.array(dtype=wp.vec4i),
-    stacks: wp.array(dtype=wp.vec2i),
-    cell_of_point: wp.array(dtype=wp.int32),
-    point_count: wp.array(dtype=wp.int32),
-    min_size: int,
-    parent: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    labels_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-):
-    """The whole of `label_points`."""
-
-
-@wp.kernel
-def label_points(
-    # in
-    ranges: wp.array(dtype=wp.vec4i),
-    stacks: wp.array(dtype=wp.vec2i),
-    cell_of_point: wp.array(dtype=wp.int32),
-    point_count: wp.array(dtype=wp.int32),
-    min_size: int,
-    # in out: members left as labels
-    parent: wp.array(dtype=wp.int32),
-    members: wp.array(dtype=wp.int32),
-    # out
-    labels_out: wp.array(dtype=wp.int32),
-    cluster_count_out: wp.array(dtype=wp.int32),
-):
-    """Counts each component's points, numbers those with enough in the order of their first, and labels the points."""
-    _label(ranges, stacks, cell_of_point, point_count, min_size, parent, members, labels_out, cluster_count_out)
-
-
 class JoinedColumns:
     """Workspace to join the cells of columns that touch; `parent` tells the components."""
 
@@ -426,24 +354,18 @@ class JoinedColumns:
         capacity = by_cell.points.shape[0]
         cells = capacity + by_cell.parts
 
-        def buffer(length: int, dtype: type = wp.int32) -> wp.array:
-            return wp.empty(length, dtype=dtype, device=DEFAULT_DEVICE)
+        def buffer(shape: int | tuple[int, int] = cells, dtype: type = wp.int32) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=DEFAULT_DEVICE)
 
-        self.parent = buffer(cells)
+        self.parent = buffer()
         """Of each cell one of its component, and of that itself."""
-        given = [columns, stacks, points, radius]
-        self._join = by_cell.packed(
-            join_own_columns,
-            [by_cell.layout, ranges, *given],
-            [
-                wp.full(map_places(capacity), -1, dtype=wp.int32, device=DEFAULT_DEVICE),
-                *(buffer(FORWARD * capacity), buffer(capacity, wp.uint64), buffer(capacity)),
-                *(buffer(cells), buffer(cells, wp.uint64), buffer(cells), self.parent),
-            ],
-        )
+        given = [ranges, columns, stacks, points, radius]
+        own = [buffer(), buffer(), buffer(), buffer(cells + _LANES)]
+        lanes = [buffer((6, cells + _LANES), wp.float32), buffer((3, capacity + _LANES), wp.float32)]
+        self._join = by_cell.packed(join_own_columns, given, [*own, *lanes, self.parent])
         self._join_borders = None
         if by_cell.parts > 1:
-            self._join_borders = PackedLaunch(join_borders, None, [ranges, *given], [self.parent])
+            self._join_borders = PackedLaunch(join_borders, None, given, [self.parent])
 
     def launch(self) -> None:
         """Joins the cells."""

@@ -19,9 +19,9 @@ import warp as wp
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, is_near, radius_of, touch, unite
 from .cell_table import CellTable, cell_at, free_slot
-from .cluster_columns import JoinedColumns, label_points
-from .column_neighbors import map_places
-from .dbscan_columns import find_cores, label_others, map_columns, pick_cores, unmap_columns
+from .cluster_columns import JoinedColumns
+from .cluster_labels import label_points
+from .dbscan_columns import MOST_NEAR, ROWS, find_cores, label_others, list_rows, pick_cores
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -329,12 +329,10 @@ class Dbscan:
             keep(name, wp.empty(shape, dtype=dtype, device=DEFAULT_DEVICE))
 
         keep("_by_cell", by_cell)
-        around = sorted(np.ndindex(5, 5), key=lambda d: ((d[0] - 2) ** 2 + (d[1] - 2) ** 2, d))
-        keep("_around", wp.array(np.array(around, np.int32) - 2, dtype=wp.vec2i, device=DEFAULT_DEVICE))
-        keep("_column_map", wp.full(map_places(self.capacity), -1, dtype=wp.int32, device=DEFAULT_DEVICE))
         keep("_core_ranges", wp.zeros(by_cell.parts, dtype=wp.vec4i, device=DEFAULT_DEVICE))
-        buffer("_neighbours", wp.vec2i, (by_cell.parts, len(around)))
-        buffer("_core_columns", wp.vec4i)
+        buffer("_rows", wp.vec2i, ROWS * self.capacity)
+        buffer("_neighbours", wp.vec2i, (by_cell.parts, MOST_NEAR))
+        buffer("_core_columns", wp.vec4i, self.capacity + 1)
         buffer("_core_stacks", wp.vec2i)
         buffer("_core_points", wp.vec3)
         for name in ("_near", "_core_cell", "_core_cell_of_point", "_members"):
@@ -405,15 +403,14 @@ class Dbscan:
         by_cell.launch(xyz, count, self._no_include, 0)
         columns = [by_cell.ranges, by_cell.columns]
         cells = [by_cell.stacks, by_cell.points]
-        on_map = [by_cell.layout, *columns]
-        around = [self._around, self._column_map, self._radius, least]
+        around = [self._rows, self._radius, least]
         # Cores.
         by_cell.run(
-            map_columns,
-            [*on_map, by_cell.cell_of_point, by_cell.point_count],
-            [self._column_map, self._core_cell_of_point, self.core],
+            list_rows,
+            [*columns, by_cell.cell_of_point, by_cell.point_count],
+            [self._rows, self._core_cell_of_point, self.core],
         )
-        by_cell.run(find_cores, [*on_map, *cells, *around], [self._neighbours, self._near])
+        by_cell.run(find_cores, [*columns, *cells, *around], [self._neighbours, self._near])
         # Their components, numbered by the lowest.
         cores = [self._core_ranges, self._core_columns, self._core_stacks, self._core_points]
         by_cell.run(
@@ -433,12 +430,11 @@ class Dbscan:
         by_cell.run(
             label_others,
             [
-                *(*on_map, *cells, by_cell.order, self._near, self._core_stacks, self._core_points, self._core_cell),
+                *(*columns, *cells, by_cell.order, self._near, self._core_stacks, self._core_points, self._core_cell),
                 *(of_cores.parent, self._members, *around),
             ],
             [self._neighbours, self.labels, self.core],
         )
-        by_cell.run(unmap_columns, on_map, [self._column_map])
 
 
 def dbscan(points: Any, eps: float, min_points: int) -> Any:

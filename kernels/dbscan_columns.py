@@ -8,128 +8,92 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cell_columns import Layout, is_before, row_of
 from .cell_pairs import Radius, is_near
+from .column_neighbors import NEAR_COLUMNS
+from .device import DEFAULT_DEVICE  # noqa: F401  (starts Warp)
+from .parts import part_start
 from .unchecked import at, put
 
-__all__ = ["find_cores", "label_others", "map_columns", "pick_cores", "unmap_columns"]
+__all__ = ["MOST_NEAR", "ROWS", "find_cores", "label_others", "list_rows", "pick_cores"]
 
 # Whether a pair is within the radius must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
 _NO_LABEL = wp.constant(wp.int32(2**31 - 1))
-_MARGIN = wp.constant(2)  # columns free on either side of the map, so that no neighbour is in another row
+ROWS = 5
+"""Rows of columns that have some near one: its own, and two on either side."""
+MOST_NEAR = 25
+"""Columns near one, itself among them."""
+_ROWS = wp.constant(ROWS)
 
 
-@wp.func
-def _is_mapped(layout: Layout, size: int) -> bool:
-    rows = layout.levels * (layout.width + 2 * _MARGIN)
-    return layout.high_digits > 0 and rows <= size // (layout.depth + 2 * _MARGIN)
-
-
-@wp.func
-def _place_of(x: int, y: int, layout: Layout) -> int:
-    row = row_of(x, layout, 2 * _MARGIN) + _MARGIN
-    return row * (layout.depth + 2 * _MARGIN) + y - layout.least[1] + _MARGIN
-
-
-@wp.func
-def _search_column(x: int, y: int, ranges: wp.array(dtype=wp.vec4i), columns: wp.array(dtype=wp.vec4i)) -> int:
-    """The column at x and y, by bisection, or -1."""
-    found = int(-1)
-    for p in range(ranges.shape[0]):
-        low = ranges[p][2]
-        high = ranges[p][3]
-        end = high
-        while low < high:
-            middle = low + (high - low) // 2
-            if is_before(at(columns, middle), x, y):
-                low = middle + 1
-            else:
-                high = middle
-        if low < end and at(columns, low)[0] == x and at(columns, low)[1] == y:
-            found = low
-    return found
-
-
-@wp.func
-def _list_neighbours(
-    k: int,
-    layout: Layout,
-    ranges: wp.array(dtype=wp.vec4i),
-    columns: wp.array(dtype=wp.vec4i),
-    offsets: wp.array(dtype=wp.vec2i),
-    column_map: wp.array(dtype=wp.int32),
-    neighbours: wp.array(dtype=wp.vec2i),
-) -> int:
-    """Lists the column and those around it, by their first and last cells, and gives how many they are."""
-    x = at(columns, k)[0]
-    y = at(columns, k)[1]
-    mapped = _is_mapped(layout, column_map.shape[0])
-    row_length = layout.depth + 2 * _MARGIN
-    place = int(0)
-    if mapped:
-        place = _place_of(x, y, layout)
-    listed = int(0)
-    o = int(0)
-    while o < offsets.shape[0]:
-        offset = at(offsets, o)
-        other = int(-1)
-        if mapped:
-            other = at(column_map, place + offset[0] * row_length + offset[1])
-        else:
-            other = _search_column(x + offset[0], y + offset[1], ranges, columns)
-        if other >= 0:
-            put(neighbours, listed, wp.vec2i(at(columns, other)[2], at(columns, other)[3]))
-            listed += 1
-        o += 1
-    return listed
+# Its own row first, then those beside it.
+@wp.func_native(
+    "#ifndef __CUDA_ARCH__  // for CPUs alone"
+    + NEAR_COLUMNS
+    + """
+    const int parts = ranges.shape[0], begin = ranges.data[part][2], end = ranges.data[part][3];
+    for (int row = 0; row < 5; ++row) {
+        const int dx = row % 2 == 0 ? row / 2 : -(row + 1) / 2;
+        for (int k = begin; k < end; ++k) rows_out.data[5ll * k + row] = wp::vec2i(0, 0);
+        // A row is all of one part.
+        for (int other = 0; other < parts; ++other) {
+            const int first = ranges.data[other][2], last = ranges.data[other][3];
+            NearColumns near{columns.data, last, dx, 2, first, first};
+            for (int k = begin; k < end; ++k) {
+                near.move_to(k);
+                if (near.first < near.last) rows_out.data[5ll * k + row] = wp::vec2i(near.first, near.last);
+            }
+        }
+    }
+    #endif
+"""
+)
+def _list_rows(
+    part: int, ranges: wp.array(dtype=wp.vec4i), columns: wp.array(dtype=wp.vec4i), rows_out: wp.array(dtype=wp.vec2i)
+):
+    """The stretches of columns near each of a part's."""
 
 
 @wp.kernel
-def map_columns(
+def list_rows(
     part: int,
     parts: int,
     # in
-    layout_in: wp.array(dtype=Layout),
     ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
     cell_of_point: wp.array(dtype=wp.int32),
     point_count: wp.array(dtype=wp.int32),
-    # in out: -1 where there is no column
-    column_map: wp.array(dtype=wp.int32),
-    # out, of points that are left out
+    # out: of each column those near it, row by row; of points that are left out
+    rows_out: wp.array(dtype=wp.vec2i),
     core_cell_of_point: wp.array(dtype=wp.int32),
     core_out: wp.array(dtype=wp.bool),
 ):
-    """Puts the columns on the map, and marks the points that take no part."""
-    layout = layout_in[0]
-    if _is_mapped(layout, column_map.shape[0]):
-        for k in range(ranges[part][2], ranges[part][3]):
-            put(column_map, _place_of(at(columns, k)[0], at(columns, k)[1], layout), k)
+    """Lists what is near each column, and marks the points that take no part."""
+    _list_rows(part, ranges, columns, rows_out)
     n = point_count[0]
-    for i in range(n * part // parts, n * (part + 1) // parts):
+    for i in range(part_start(n, part, parts), part_start(n, part + 1, parts)):
         if at(cell_of_point, i) < 0:
             core_cell_of_point[i] = -1
             core_out[i] = False
 
 
-@wp.kernel
-def unmap_columns(
-    part: int,
-    parts: int,
-    # in
-    layout_in: wp.array(dtype=Layout),
-    ranges: wp.array(dtype=wp.vec4i),
-    columns: wp.array(dtype=wp.vec4i),
-    # in out
-    column_map: wp.array(dtype=wp.int32),
-):
-    """Takes the columns off the map."""
-    layout = layout_in[0]
-    if _is_mapped(layout, column_map.shape[0]):
-        for k in range(ranges[part][2], ranges[part][3]):
-            put(column_map, _place_of(at(columns, k)[0], at(columns, k)[1], layout), -1)
+@wp.func
+def _list_neighbours(
+    k: int, rows: wp.array(dtype=wp.vec2i), columns: wp.array(dtype=wp.vec4i), neighbours: wp.array(dtype=wp.vec2i)
+) -> int:
+    """Lists the column and those around it, by their first and last cells, and gives how many they are."""
+    listed = int(0)
+    row = int(0)
+    while row < _ROWS:
+        near = at(rows, k * _ROWS + row)
+        other = near[0]
+        while other < near[1]:
+            put(neighbours, listed, wp.vec2i(at(columns, other)[2], at(columns, other)[3]))
+            listed += 1
+            other += 1
+        row += 1
+    return listed
 
 
 @wp.kernel
@@ -137,13 +101,11 @@ def find_cores(
     part: int,
     parts: int,
     # in
-    layout_in: wp.array(dtype=Layout),
     ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
-    offsets: wp.array(dtype=wp.vec2i),
-    column_map: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=wp.vec2i),
     radius: Radius,
     min_points: int,
     # out: of each part the columns around one; how many points are near each, up to `min_points`
@@ -151,7 +113,6 @@ def find_cores(
     near_out: wp.array(dtype=wp.int32),
 ):
     """Counts what is near each point; a cell with as many as make a core needs no count."""
-    layout = layout_in[0]
     neighbours = neighbours_out[part]
     k = ranges[part][2]
     while k < ranges[part][3]:
@@ -170,7 +131,7 @@ def find_cores(
             if size < min_points:
                 undecided = size
                 if listed < 0:
-                    listed = _list_neighbours(k, layout, ranges, columns, offsets, column_map, neighbours)
+                    listed = _list_neighbours(k, rows, columns, neighbours)
             z = at(stacks, a)[0]
             n = int(0)
             while undecided > 0 and n < listed:
@@ -267,7 +228,6 @@ def label_others(
     part: int,
     parts: int,
     # in
-    layout_in: wp.array(dtype=Layout),
     ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
@@ -279,8 +239,7 @@ def label_others(
     core_cell: wp.array(dtype=wp.int32),
     parent: wp.array(dtype=wp.int32),
     label_of_root: wp.array(dtype=wp.int32),
-    offsets: wp.array(dtype=wp.vec2i),
-    column_map: wp.array(dtype=wp.int32),
+    rows: wp.array(dtype=wp.vec2i),
     radius: Radius,
     min_points: int,
     # out
@@ -289,7 +248,6 @@ def label_others(
     core_out: wp.array(dtype=wp.bool),
 ):
     """Gives points that are no cores the lowest label of a core near them, if there is one."""
-    layout = layout_in[0]
     neighbours = neighbours_out[part]
     k = ranges[part][2]
     while k < ranges[part][3]:
@@ -308,7 +266,7 @@ def label_others(
                 core_out[at(order, i)] = is_core
                 if not is_core:
                     if listed < 0:
-                        listed = _list_neighbours(k, layout, ranges, columns, offsets, column_map, neighbours)
+                        listed = _list_neighbours(k, rows, columns, neighbours)
                     point = at(points, i)
                     label = int(own)
                     n = int(0)

@@ -16,8 +16,7 @@ import warp as wp
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, unite
 from .cell_table import CellTable, cell_at
-from .cluster_columns import label_points
-from .column_neighbors import map_places
+from .cluster_labels import label_points
 from .device import DEFAULT_DEVICE, resolve_device
 from .grid_columns import join_border_voxels, join_own_voxels
 from .interop import borrow_points, count_on, give
@@ -121,12 +120,11 @@ class GridCluster:
         buffers(wp.int32, "labels")
         keep("cluster_count", wp.zeros(1, dtype=wp.int32, device=device))
         if sequential:
-            by_cell = CellColumns(grid, self.capacity)
+            by_cell = CellColumns(grid, self.capacity, ordered=False)
             keep("_by_cell", by_cell)
-            for name in ("_parent", "_members", "_places"):
+            for name in ("_parent", "_members"):
                 keep(name, wp.empty(self.capacity + by_cell.parts, dtype=wp.int32, device=device))
             keep("_masks", wp.empty(self.capacity, dtype=wp.uint64, device=device))
-            keep("_column_map", wp.full(map_places(self.capacity), -1, dtype=wp.int32, device=device))
         else:
             keep("_by_cell", CellTable(grid, self.capacity, device))
 
@@ -160,15 +158,13 @@ class GridCluster:
         by_cell, axes = self._by_cell, _AXES[self.connectivity]
         by_cell.launch(xyz, count, self._no_include, 0)
         voxels = [by_cell.ranges, by_cell.columns, by_cell.stacks, axes]
-        by_cell.run(
-            join_own_voxels, [by_cell.layout, *voxels], [self._column_map, self._places, self._masks, self._parent]
-        )
+        by_cell.run(join_own_voxels, voxels, [self._masks, self._parent])
 
         def run(kernel: wp.Kernel, inputs: list, outputs: list) -> None:
             wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=self.device)
 
         if by_cell.parts > 1:
-            run(join_border_voxels, voxels, [self._parent])
+            run(join_border_voxels, [*voxels, self._masks], [self._parent])
         run(
             label_points,
             [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, by_cell.point_count, self.min_size],

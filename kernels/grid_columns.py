@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .cell_columns import Layout, aligned, is_before, row_of
+from .cell_columns import aligned, is_before
 from .cell_pairs import find
 from .unchecked import at, put
 
@@ -87,24 +87,33 @@ def _unite_rows(
     last: int,
     others: int,
     others_end: int,
-    dx: int,
     axes: int,
     stacks: wp.array(dtype=wp.vec2i),
+    masks: wp.array(dtype=wp.uint64),
     parent: wp.array(dtype=wp.int32),
 ):
-    """Unites the voxels of columns with those of others `dx` rows on."""
-    head = int(others)
-    for k in range(first, last):
-        here = at(columns, k)
-        x = here[0] + dx
-        while head < others_end and is_before(at(columns, head), x, here[1] - 1):
-            head += 1
-        other = int(head)
-        while other < others_end and at(columns, other)[0] == x and at(columns, other)[1] <= here[1] + 1:
-            reach = _reach_of(dx, at(columns, other)[1] - here[1], axes)
-            if other != k and reach >= 0:
-                _unite_heights(here, at(columns, other), reach, stacks, parent)
-            other += 1
+    """Unites the voxels of columns with those after them among others, which stand in the same order."""
+    dx = int(0)
+    while dx < 2:
+        head = int(others)
+        for k in range(first, last):
+            here = at(columns, k)
+            here_mask = at(masks, k)
+            x = here[0] + dx
+            while head < others_end and ((head <= k and dx == 0) or is_before(at(columns, head), x, here[1] - 1)):
+                head += 1
+            other = int(head)
+            while other < others_end and at(columns, other)[0] == x and at(columns, other)[1] <= here[1] + 1:
+                there = at(columns, other)
+                there_mask = at(masks, other)
+                reach = _reach_of(dx, there[1] - here[1], axes)
+                far = wp.max(wp.abs(there[0]), wp.abs(there[1])) >= _LARGEST_CELL - 1
+                if reach >= 0 and (far or here_mask == wp.uint64(0) or there_mask == wp.uint64(0)):
+                    _unite_heights(here, there, reach, stacks, parent)
+                elif reach >= 0:
+                    _unite_masks(here, there, here_mask, there_mask, reach, stacks, parent)
+                other += 1
+        dx += 1
 
 
 @wp.kernel
@@ -112,25 +121,17 @@ def join_own_voxels(
     part: int,
     parts: int,
     # in
-    layout_in: wp.array(dtype=Layout),
     ranges: wp.array(dtype=wp.vec4i),
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     axes: int,
-    # in out: a map of columns, -1 where there is none, and left so
-    column_map: wp.array(dtype=wp.int32),
-    # out: the columns' places on the map; their voxels' heights above the lowest as a mask, 0 where it is too short
-    places: wp.array(dtype=wp.int32),
+    # out: the columns' voxels by height above the lowest as a mask, 0 where it is too short
     masks: wp.array(dtype=wp.uint64),
     parent: wp.array(dtype=wp.int32),
 ):
     """Unites the voxels of a part that are neighbours."""
-    layout = layout_in[0]
     begin = ranges[part][2]
     end = ranges[part][3]
-    # A column free on either side, so that no neighbour is in the next row.
-    row_length = layout.depth + 2
-    mapped = layout.high_digits > 0 and layout.width + 1 <= column_map.shape[0] // row_length
     k = int(begin)
     while k < end:
         column = at(columns, k)
@@ -151,45 +152,8 @@ def join_own_voxels(
         if z - lowest > 63 or lowest <= 1 - _LARGEST_CELL or z >= _LARGEST_CELL - 1:
             mask = wp.uint64(0)
         put(masks, k, mask)
-        if mapped:
-            place = row_of(column[0], layout, 1) * row_length + column[1] - layout.least[1] + 1
-            put(places, k, place)
-            put(column_map, place, k)
         k += 1
-    k = begin
-    while mapped and k < end:
-        here = at(columns, k)
-        place = at(places, k)
-        here_mask = at(masks, k)
-        o = int(0)
-        while o < 4:
-            dx = wp.min(o, 1)
-            dy = int(1)
-            if o == 1:
-                dy = 0
-            elif o == 2:
-                dy = -1
-            other = at(column_map, place + dx * row_length + dy)
-            reach = _reach_of(dx, dy, axes)
-            if reach >= 0 and other >= begin and other < end:
-                there = at(columns, other)
-                there_mask = at(masks, other)
-                far = wp.max(wp.abs(there[0]), wp.abs(there[1])) >= _LARGEST_CELL - 1
-                if far or here_mask == wp.uint64(0) or there_mask == wp.uint64(0):
-                    _unite_heights(here, there, reach, stacks, parent)
-                else:
-                    _unite_masks(here, there, here_mask, there_mask, reach, stacks, parent)
-            o += 1
-        k += 1
-    k = begin
-    while mapped and k < end:
-        put(column_map, at(places, k), -1)
-        k += 1
-    if not mapped:
-        dx = int(0)
-        while dx < 2:
-            _unite_rows(columns, begin, end, begin, end, dx, axes, stacks, parent)
-            dx += 1
+    _unite_rows(columns, begin, end, begin, end, axes, stacks, masks, parent)
 
 
 @wp.kernel
@@ -199,6 +163,7 @@ def join_border_voxels(
     columns: wp.array(dtype=wp.vec4i),
     stacks: wp.array(dtype=wp.vec2i),
     axes: int,
+    masks: wp.array(dtype=wp.uint64),
     # in out
     parent: wp.array(dtype=wp.int32),
 ):
@@ -215,7 +180,4 @@ def join_border_voxels(
                 first = int(last)
                 while first > ranges[p][2] and not is_before(columns[first - 1], x, y):
                     first -= 1
-                dx = int(0)
-                while dx < 2:
-                    _unite_rows(columns, first, last, begin, end, dx, axes, stacks, parent)
-                    dx += 1
+                _unite_rows(columns, first, last, begin, end, axes, stacks, masks, parent)

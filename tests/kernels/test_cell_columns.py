@@ -1,5 +1,7 @@
 """Points sorted into columns of cells, against NumPy's lexsort."""
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -17,8 +19,9 @@ def clouds():
     street = rng.normal(0, [20, 20, 1.5], (3_000, 3))
     street[::70] = np.nan
     yield "street", street
-    yield "too wide for two digits", np.concatenate([street, street + np.array((9e4, -9e4, 3e4))])
-    yield "too tall for a digit", rng.uniform(0, 1, (2_000, 3)) * (2, 2, 3e4)
+    yield "too wide for bits", np.concatenate([street, street + np.array((9e4, -9e4, 3e4))])
+    yield "blocks on top of each other", rng.uniform(0, 1, (2_000, 3)) * (5, 5, 300)
+    yield "too tall for bits", rng.uniform(0, 1, (2_000, 3)) * (200, 200, 3e4)
     yield "one cell", np.full((500, 3), 0.1)
     yield "nothing finite", np.full((20, 3), np.inf)
     yield "nothing", np.empty((0, 3))
@@ -54,3 +57,14 @@ def test_points_are_sorted_by_cell_and_cells_stand_in_columns(parts):
                     found[members] = x, y, stacks[cell, 0]
         assert at == len(order)
         np.testing.assert_array_equal(found[finite], cells, err_msg=name)
+
+
+def test_parts_have_whole_rows_and_the_order_may_be_left_out():
+    points = np.random.default_rng(3).normal(0, [20, 20, 1.5], (3_000, 3)).astype(np.float32)
+    by_cell = CellColumns(radius_of(RADIUS), len(points), 7, ordered=False)
+    include = wp.zeros(1, dtype=wp.uint8, device="cpu")
+    by_cell.launch(wp.array(points, dtype=wp.vec3, device="cpu"), count_on(len(points), "cpu"), include, 0)
+    columns = by_cell.columns.numpy()
+    rows = [set(columns[first:last, 0]) for _, _, first, last in by_cell.ranges.numpy()]
+    assert all(rows)
+    assert all(max(a) < min(b) for a, b in itertools.pairwise(rows))
