@@ -27,7 +27,8 @@ def open_source(uri: str | os.PathLike, *, device: str | None = None) -> Source:
     """Opens a source of frames by its URI.
 
     - `sim:SCENARIO` — the simulator; keys scenario, seed, duration [s], rate [Hz], lidar, mounting_height [m],
-      turning (1: sweeps take their time, as real ones do), rain [mm/h] and sensors (all, or lidar alone).
+      turning (1, the default: sweeps take their time, as real ones do; 0: they are of an instant), rain [mm/h] and
+      sensors (all, or lidar alone).
     - `kitti:DIR` — a folder of the KITTI family (`KittiSource` lists the layouts); key sequence.
     - `mcap:FILE` — a recording that `warploom record` made; key topic, by default `lidar/points`.
     - `PATH` or `file:PATH` — a scan (`.bin`, `.pcd.bin`, `.npy`, `.pcd`, `.ply`) or a folder of them.

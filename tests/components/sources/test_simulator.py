@@ -39,9 +39,32 @@ def test_a_frame_has_everything_a_real_one_can_have_and_the_truth(frames):
         assert len(truth.classes) == len(truth.ids) == len(truth.points) == k > 0
 
 
-def test_boxes_hold_the_points_that_the_truth_says(frames):
-    truth = frames[0].truth
-    held = points_in_boxes(frames[0].points, truth.boxes, margin=0.05).sum(axis=1)
+def test_sweeps_take_their_time_and_say_where_the_sensor_was(frames):
+    """At 10 Hz from half a turn before the version to half a turn after it, at some 8 m/s."""
+    for frame in frames:
+        assert frame.t.min() == pytest.approx(-0.05, abs=2e-3)
+        assert frame.t.max() == pytest.approx(0.05, abs=2e-3)
+        np.testing.assert_allclose(frame.pose_times, [-0.05, 0.0, 0.05], atol=1e-9)
+        np.testing.assert_array_equal(frame.poses[1], frame.pose)
+        assert 0.5 < np.linalg.norm(frame.poses[2, :3, 3] - frame.poses[0, :3, 3]) < 1.2
+    # One sweep ends where the next begins.
+    np.testing.assert_allclose(frames[0].poses[2], frames[1].poses[0], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def instant():
+    return next(open_source(f"{URI}&turning=0"))
+
+
+def test_sweeps_of_an_instant_need_no_poses(instant):
+    assert not instant.t.any()
+    assert instant.poses is None
+    assert instant.pose is not None
+
+
+def test_boxes_hold_the_points_that_the_truth_says(instant):
+    truth = instant.truth
+    held = points_in_boxes(instant.points, truth.boxes, margin=0.05).sum(axis=1)
     # What else stands in a box, such as the road below a car, comes on top.
     # Noise along the ray takes single points out, so a few points on an object say nothing: all together do.
     many = truth.points >= 50
