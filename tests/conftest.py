@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import sys
 import tempfile
 
 import pytest
@@ -44,3 +45,26 @@ def device(request) -> str:
     if request.param != "cpu" and not _has_cuda():
         pytest.skip("no CUDA device here")
     return request.param
+
+
+@pytest.fixture
+def warploom(monkeypatch, capfd, tmp_path):
+    """Runs the command in this process, in the test's folder, and gives its output."""
+    from warploom.cli import main
+    from warploom.dag.logs import stop_logging
+
+    def run(*arguments, expect=0):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["warploom", *map(str, arguments)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+        finally:
+            stop_logging()
+        output = "".join(capfd.readouterr())
+        assert code == expect, output
+        return output
+
+    return run

@@ -9,31 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from warploom.cli import main
-from warploom.dag.logs import stop_logging
-
 EXAMPLES = pathlib.Path(__file__).resolve().parent.parent / "examples"
-
-
-@pytest.fixture
-def warploom(monkeypatch, capfd, tmp_path):
-    """Runs the command in this process, in the test's folder, and gives its output."""
-
-    def run(*arguments, expect=0):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["warploom", *map(str, arguments)])
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code or 0
-        finally:
-            stop_logging()
-        output = "".join(capfd.readouterr())
-        assert code == expect, output
-        return output
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import subprocess
 import sys
 import tempfile
 
@@ -12,9 +13,6 @@ PARTS = pathlib.Path(__file__).parent / "dag" / "launch" / "parts"
 sys.path.insert(0, str(PARTS))
 
 from launch_nodes import DOUBLER, PLAIN, TICKER, Node  # noqa: E402
-
-from warploom.cli import main  # noqa: E402
-from warploom.dag.logs import stop_logging  # noqa: E402
 
 VALUES = {"period": 20, "size": 1000, "hang_after": 0, "journal": "", "slow_s": 0.0, "config": "{}"}
 COMMANDS = ("launch", "start-all", "ps", "top", "topics", "echo", "hz")
@@ -52,26 +50,6 @@ def folder(tmp_path, short_folder, monkeypatch):
         f"  - {{name: sink, modules: [{tmp_path}/doubler.yaml, {tmp_path}/plain.yaml]}}\n"
     )
     return tmp_path
-
-
-@pytest.fixture
-def warploom(monkeypatch, capfd):
-    """Runs the command in this process and gives its output."""
-
-    def run(*arguments, expect=0):
-        monkeypatch.setattr(sys, "argv", ["warploom", *map(str, arguments)])
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code or 0
-        finally:
-            stop_logging()
-        output = "".join(capfd.readouterr())
-        assert code == expect, output
-        return output
-
-    return run
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -132,6 +110,24 @@ def test_check_validates_everything_and_starts_nothing(folder, warploom, monkeyp
         f"<module><name>sink</name><dag_conf>{folder}/doubler.yaml</dag_conf></module></cybertron>"
     )
     assert "node 'reference' is good" in warploom("launch", xml, "--check")
+
+
+def test_checking_the_reference_node_compiles_nothing_and_leaves_out_what_only_computes(tmp_path):
+    """In a process of its own, whose cache of kernels is empty."""
+    code = (
+        "import sys; from warploom.cli import main\n"
+        "options = {'hw': 'hw50', 'lidar': 'pandar90', 'camera': '13', 'radar': 'conti430'}\n"
+        "sys.argv = ['warploom', 'launch', '--check', *(f'--{key}={value}' for key, value in options.items())]\n"
+        "try:\n    main()\nfinally:\n"
+        "    print({'scipy', 'onnxruntime', 'cv2', 'torch', 'taichi', 'matplotlib'} & set(sys.modules))"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "kernels")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[-1] == "set()"
+    assert lines[-2].endswith("node 'computing_node_hw50_pandar90_13_600' is good")
+    assert not [path for path in (tmp_path / "kernels").rglob("*") if path.is_file()]
 
 
 def test_start_all_adds_the_monitors(folder, warploom, monkeypatch):
