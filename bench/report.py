@@ -1,7 +1,7 @@
 """The report: pytest-benchmark's JSON as Markdown and plots.
 
 `python -m warploom.bench.report benchmark.json --out NAME.md` writes that, and NAME-ratios.svg and NAME-cost.svg
-beside it.
+beside it; several JSON files, of one machine, become one report.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from .plots import draw_cost, draw_ratios
-from .results import Pair, Result, read_figures, read_measured, read_pairs, read_results
+from .results import Pair, Result, merge_measured, read_figures, read_measured, read_pairs, read_results
 
 __all__ = ["number", "render", "score_row", "share", "skipped_lines", "write_report"]
 
@@ -323,15 +323,17 @@ def _yes(reached: bool) -> str:
 def main() -> None:
     """Reads the JSON and writes the report."""
     parser = argparse.ArgumentParser(prog="python -m warploom.bench.report")
-    parser.add_argument("json", type=Path, help="what pytest-benchmark wrote")
+    parser.add_argument("json", type=Path, nargs="+", help="what pytest-benchmark wrote")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks.md"), help="the Markdown file")
     given = parser.parse_args()
     try:
-        written = write_report(read_measured(given.json), given.out)
+        written = write_report(merge_measured([read_measured(path) for path in given.json]), given.out)
     except ConfigError as error:
         sys.exit(str(error))
     except KeyError as error:
-        sys.exit(f"{given.json}: has no key {error}; it must come from `pytest bench --benchmark-json`")
+        sys.exit(
+            f"{', '.join(map(str, given.json))}: has no key {error}; it must come from `pytest bench --benchmark-json`"
+        )
     sys.stdout.write(f"{', '.join(str(path) for path in written)} written\n")
 
 

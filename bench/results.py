@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..errors import ConfigError
 
-__all__ = ["Pair", "Result", "read_figures", "read_measured", "read_pairs", "read_results"]
+__all__ = ["Pair", "Result", "merge_measured", "read_figures", "read_measured", "read_pairs", "read_results"]
 
 _OURS, _PLAN, _ONE_THREAD = "warploom", "warploom plan", "warploom, 1 thread"
 
@@ -111,6 +111,20 @@ def read_measured(path: Path) -> dict[str, Any]:
             "`pytest bench --benchmark-json`"
         )
     return measured
+
+
+def merge_measured(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Several runs on one machine as one: what each measured and skipped, one after the other.
+
+    Args:
+        runs: As `read_measured` gives them, at least one; machine, date and commit are those of the first.
+    """
+    skipped = {name: reason for run in runs for name, reason in run["warploom"].get("skipped", {}).items()}
+    return {
+        **runs[0],
+        "benchmarks": [entry for run in runs for entry in run["benchmarks"]],
+        "warploom": {**runs[0]["warploom"], "skipped": skipped},
+    }
 
 
 def read_results(measured: dict[str, Any]) -> list[Result]:

@@ -172,3 +172,32 @@ def test_the_command_writes_the_report(run_of, entry, tmp_path):
     path.write_text(json.dumps(run_of(entry("warploom", 0.005))))
     subprocess.run([sys.executable, "-m", "warploom.bench.report", str(path), "--out", str(out)], check=True)
     assert out.read_text(encoding="utf-8").startswith("# Benchmarks\n")
+
+
+def test_several_runs_become_one_report(run_of, entry, tmp_path):
+    """Ours and its peer may stand in different files."""
+    paths = [tmp_path / f"{who}.json" for who in ("warploom", "scipy")]
+    for path, run in zip(paths, (entry("warploom", 0.005), entry("scipy", 0.25, goal=0.1)), strict=True):
+        path.write_text(json.dumps(run_of(run)))
+    out = tmp_path / "report.md"
+    command = [sys.executable, "-m", "warploom.bench.report", *map(str, paths), "--out", str(out)]
+    subprocess.run(command, check=True)
+    assert "1/50" in out.read_text()
+
+
+def test_a_file_of_benchmarks_that_fails_takes_no_other_along(tmp_path):
+    timed = "def bench_it(benchmark):\n    benchmark.extra_info.update(kernel='k', on='x')\n    benchmark(lambda: 1)\n"
+    settings = "from warploom.bench.conftest import pytest_benchmark_update_json\n"
+    (tmp_path / "conftest.py").write_text(settings)
+    (tmp_path / "pytest.ini").write_text("[pytest]\npython_files = bench_*.py\npython_functions = bench_*\n")
+    (tmp_path / "bench_good.py").write_text(timed)
+    (tmp_path / "bench_half.py").write_text(timed + "def bench_bad(benchmark):\n    raise ValueError('bad')\n")
+    (tmp_path / "bench_gone.py").write_text("import no_such_module_at_all\n")
+    files = [str(tmp_path / f"bench_{name}.py") for name in ("gone", "half", "good")]
+    command = [sys.executable, "-m", "warploom.bench", *files, "--out", str(tmp_path / "b.md"), "--max-time", "0.01"]
+    done = subprocess.run([*command, "--keep", str(tmp_path / "keep")], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "bench_gone: " in done.stdout
+    assert done.stdout.count("pytest ended with") == 2
+    assert (tmp_path / "b.md").read_text().startswith("# Benchmarks")
+    assert sorted(path.name for path in (tmp_path / "keep").glob("*.json")) == ["bench_good.json", "bench_half.json"]
