@@ -143,7 +143,8 @@ class DetectionHead:
             sensor_height: Height of the sensor above the ground [m]: a number or a device array of one float32.
 
         Returns:
-            Boxes in the sensor's frame, best score first; velocities are NaN, as one scan does not show them.
+            Boxes in the sensor's frame, best score first; velocities are NaN, as one scan does not show them. A box
+            that holds the sensor is of the vehicle that carries it, or of the hole around it, and is left out.
         """
         return self._detect([(xyz, count, sensor_height)])[0]
 
@@ -214,10 +215,18 @@ class DetectionHead:
         if kept == 0:
             return Detections.empty()
         keep = slot.nms.keep.numpy()[:kept]
+        keep = keep[~_holds_the_sensor(slot.decode.boxes.numpy()[keep])]
         return Detections(
             boxes=slot.decode.boxes.numpy()[keep],
             scores=slot.decode.scores.numpy()[keep],
             classes=self._class_indices[slot.decode.classes_found.numpy()[keep]],
-            velocities=np.full((kept, 2), np.nan, np.float32),
-            background=np.zeros(kept, bool),
+            velocities=np.full((len(keep), 2), np.nan, np.float32),
+            background=np.zeros(len(keep), bool),
         )
+
+
+def _holds_the_sensor(boxes: np.ndarray) -> np.ndarray:
+    """Which boxes have the origin inside, seen from above; shape (k,), bool."""
+    c, s = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
+    along, across = boxes[:, 0] * c + boxes[:, 1] * s, boxes[:, 1] * c - boxes[:, 0] * s
+    return (2.0 * np.abs(along) < boxes[:, 3]) & (2.0 * np.abs(across) < boxes[:, 4])

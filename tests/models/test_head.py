@@ -104,6 +104,14 @@ def test_little_or_no_cloud_gives_no_objects(head, points):
     assert len(head.detect_points(points.astype(np.float32), 1.7)) == 0
 
 
+def test_a_box_that_holds_the_sensor_is_left_out():
+    from warploom.models.head import _holds_the_sensor
+
+    boxes = np.array([[1, 0.5, -1, 4, 2, 1.5, 0.1], [0, 2.5, -1, 4, 2, 1.5, 0], [0, 2.5, -1, 8, 2, 1.5, np.pi / 2]])
+    assert _holds_the_sensor(boxes).tolist() == [True, False, True]
+    assert _holds_the_sensor(np.empty((0, 7))).tolist() == []
+
+
 def test_a_higher_threshold_gives_fewer(head, scenes):
     points, height, _ = scenes[0]
     strict = DetectionHead(threads=2, score_threshold=0.6).detect_points(points, height)

@@ -1,0 +1,73 @@
+"""`python -m warploom.models.training.averaging`: one head of several trainings that began with the same weights.
+
+Networks fine-tuned from one checkpoint with different seeds lie in one valley, and the mean of their weights does at
+least as well as each by itself at the cost of one (model soups, Wortsman et al., ICML 2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from .loop import averaged_weights
+from .network import PillarCenterNet
+
+__all__ = ["average_networks"]
+
+
+def average_networks(checkpoints: Sequence[Path], network: PillarCenterNet) -> PillarCenterNet:
+    """Gives a network the mean of the weights of several checkpoints, of which each is a running average already.
+
+    Args:
+        checkpoints: `checkpoint.pt` of trainings of networks of the same shape.
+        network: Of that shape; it is changed.
+
+    Raises:
+        ValueError: None given.
+    """
+    if not checkpoints:
+        raise ValueError("checkpoints must be one or more, not none")
+    states = [averaged_weights(torch.load(path, weights_only=True)) for path in checkpoints]
+    mean = {
+        name: torch.stack([state[name].double() for state in states]).mean(0).to(first.dtype)
+        if first.is_floating_point()
+        else first
+        for name, first in states[0].items()
+    }
+    network.load_state_dict(mean)
+    return network.eval()
+
+
+def main(
+    checkpoints: Annotated[list[Path], typer.Argument(help="checkpoint.pt of each training.")],
+    out: Annotated[Path, typer.Option(help="Folder for the head's ONNX and YAML.")],
+    stem: Annotated[int, typer.Option(help="As in training.")] = 24,
+    lean: Annotated[bool, typer.Option("--lean", help="As in training.")] = False,
+    extra: Annotated[list[str] | None, typer.Option(help="As in training.")] = None,
+    score: Annotated[float, typer.Option(help="The threshold that the card recommends.")] = 0.3,
+    overlap_weight: Annotated[float, typer.Option(help="Share of the thought overlap in a score.")] = 0.0,
+) -> None:
+    """Writes the head whose weights are the mean of those of several trainings."""
+    from ...kernels.pillar import pillar_channels
+    from .export import export_head
+    from .network import LEAN_CHANNELS
+
+    network = PillarCenterNet(
+        (stem, 48, 128), channels=LEAN_CHANNELS if lean else pillar_channels(), extras=tuple(extra or ())
+    )
+    card = export_head(
+        average_networks(checkpoints, network),
+        out,
+        score_threshold=score,
+        overlap_weight=overlap_weight,
+        training={"mean_of": [str(path.parent.name) for path in checkpoints]},
+    )
+    typer.echo(card)
+
+
+if __name__ == "__main__":
+    typer.run(main)
