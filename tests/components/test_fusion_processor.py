@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from warploom.components.messages import CameraObjects, DetectedObjects, RadarObjects, SensorFrame
+from warploom.components.messages import CameraObjects, CameraSet, DetectedObjects, RadarObjects, RadarSet, SensorFrame
 from warploom.components.perception import FusionProcessor, TrackingProcessor
 from warploom.dag import ProcessorHarness
 from warploom.datamesh.messages import decode, encode
@@ -93,3 +93,38 @@ def test_messages_survive_the_codec(message):
     back = decode(encode(message))
     for each in dataclasses.fields(message):
         np.testing.assert_array_equal(getattr(back, each.name), getattr(message, each.name))
+
+
+def test_it_says_which_sensors_joined_and_which_are_missing():
+    harness = ProcessorHarness(FusionProcessor, {"sensors": ["front", "radar"]})
+    assert harness.processor.state()["missing"] == "front radar"
+    harness.feed(detected=detected(5, CAR), cameras=CameraSet(version=CAMERA.version, cameras=(CAMERA,))).run(5 * NS)
+    assert harness.processor.state() == {"tracks": 1, "joined": "front 0 ms", "missing": "radar"}
+    harness.feed(radars=RadarSet(version=RADAR.version, radars=(RADAR,)), detected=detected(6, CAR)).run(6 * NS)
+    assert harness.processor.state() == {"tracks": 1, "joined": "front 100 ms radar 100 ms"}
+
+
+def test_a_sensor_that_nobody_announced_is_missed_once_it_was_there():
+    harness = ProcessorHarness(FusionProcessor)
+    first = harness.feed(detected=detected(5, CAR), cameras=CAMERA).run(5 * NS)["obstacles"]
+    later = harness.feed(detected=detected(12, CAR)).run(12 * NS)["obstacles"]
+    assert first.missing_inputs == ("background",)
+    assert later.missing_inputs == ("background", "front")
+    assert harness.processor.losses.as_dict() == {"FusionProcessor": {"stale": 1}}
+
+
+@pytest.mark.parametrize("processor", [TrackingProcessor, FusionProcessor])
+def test_what_cannot_be_used_is_counted_by_reason(processor):
+    harness = ProcessorHarness(processor)
+    bad = (np.nan, 0, 0, 4.4, 1.9, 1.6, 0)
+    flat = (60, 0, 0, 4.4, 0, 1.6, 0)
+    harness.feed(detected=detected(5, CAR, bad, flat)).run(5 * NS)
+    harness.feed(detected=detected(6, CAR, bad)).run(6 * NS)
+    harness.feed(detected=detected(7, CAR, pose=False)).run(7 * NS)
+    harness.feed(detected=detected(90, CAR)).run(90 * NS)
+    (told,) = harness.processor.losses.as_dict().values()
+    # Fusion has a tracker of its own for radar targets, which knows of the missing pose as well.
+    assert told["not finite"] == 2
+    assert told["size not positive"] == 1
+    assert told["gap"] == 1
+    assert told["pose missing"] >= 1

@@ -1,8 +1,12 @@
 """Scores of a drive whose truth is known, on frames made by hand; and the tracker on them."""
 
+import itertools
+import json
+
 import numpy as np
 import pytest
 
+from warploom.components.evaluation import tracking_objects
 from warploom.components.evaluation.tracking_objects import drive_uris, lines_of_drives, score_drives
 from warploom.components.messages import Obstacles, SensorFrame, Truth
 from warploom.errors import ConfigError, SourceError
@@ -155,3 +159,40 @@ def test_velocities_and_ids_through_a_second_of_occlusion():
     assert occlusions > 60
     assert kept >= 0.9 * occlusions
     assert np.median(errors) <= 0.5
+
+
+def test_scans_give_poses_to_the_tracker_and_result_files(shared_data, tmp_path, monkeypatch):
+    """The first frames of a sequence: the ego poses of its GPS/IMU records go with the scans."""
+    data = shared_data / "kitti_tracking"
+    whole, poses = tracking_objects._scans, []
+
+    def first(sequence, folder):
+        for scan in itertools.islice(whole(sequence, folder), 8):
+            poses.append(scan.pose)
+            yield scan
+
+    monkeypatch.setattr(tracking_objects, "_scans", first)
+    results = tracking_objects.evaluate_scans(data, ["0000"], tmp_path)
+    steps = np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
+    records = np.loadtxt(data / "oxts" / "0000.txt")
+    speed = np.hypot(records[:8, 8], records[:8, 9])  # forward and leftward [m/s]
+    np.testing.assert_allclose(steps, 0.1 * speed[:7], atol=0.1)  # records are 0.1 s apart, give or take
+    assert {result.kind.name for result in results} <= {"Car", "Pedestrian", "Cyclist"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert set(summary) == {result.kind.name for result in results}
+    rows = [line.split() for line in (tmp_path / "0000.txt").read_text().splitlines()]
+    assert rows
+    assert all(len(row) == 18 for row in rows)
+    assert [int(row[0]) for row in rows] == sorted(int(row[0]) for row in rows)
+    assert all((tmp_path / f"recall_{name}.png").is_file() for name in summary)
+
+
+def test_true_detections_keep_ids_and_velocities(tmp_path):
+    """The scripted rider behind a van, with a coarse sensor to be quick; the whole campaign is the command."""
+    result = tracking_objects.evaluate_drives(
+        "sim:occlusion?seed=1&duration=6.5&lidar=vlp16&sensors=lidar", tmp_path, true_detections=True
+    )
+    assert result.occlusions >= 1
+    assert result.kept == result.occlusions
+    assert result.settled_velocity_error < 0.5
+    assert json.loads((tmp_path / "summary.json").read_text())["ids_kept"] == result.kept
