@@ -379,17 +379,16 @@ class Fusion:
 
     def _names_of(self, version: int, tracks: Tracks, own: Tracks) -> np.ndarray:
         """The ids of the objects behind the tracks of both trackers."""
-        names, taken = [], set()
-        for each in (*(("lidar", i) for i in tracks.ids.tolist()), *(("radar", i) for i in own.ids.tolist())):
-            name = self._names[each][0] if each in self._names else 0
-            if not name or name in taken:
+        names: dict[int, None] = {}
+        for each in [*(("lidar", i) for i in tracks.ids.tolist()), *(("radar", i) for i in own.ids.tolist())]:
+            name, _ = self._names.get(each, (0, 0))
+            if not name or name in names:
                 name, self._next_id = self._next_id, self._next_id + 1
-            taken.add(name)
             self._names[each] = (name, version)
-            names.append(name)
+            names[name] = None
         if len(self._names) > _MANY_NAMES:
             self._names = {k: v for k, v in self._names.items() if version - v[1] <= _FORGET_NS}
-        return np.array(names, np.int64)
+        return np.array(list(names), np.int64)
 
 
 def _radar_config(config: FusionConfig) -> TrackerConfig:

@@ -81,15 +81,16 @@ def image_boxes(
         age: Of the image [s].
 
     Returns:
-        Left, top, right, bottom, cut at the image's edges [pixels], shape (n, 4); and whether at least a quarter of
-        the area is in the image, shape (n,).
+        Left, top, right, bottom, cut at the image's edges [pixels], zero for what is behind the camera, shape (n, 4);
+        and whether at least a quarter of the area is in the image, shape (n,).
     """
     moved = np.array(boxes, np.float64).reshape(-1, 7)
     if velocities is not None:
         moved[:, :2] -= age * np.nan_to_num(velocities)
-    corners = box_corners(moved)
     T = camera.projection @ _then_from_now(pose, camera.pose)
-    uvw = corners @ T[:, :3].T + T[:, 3]
+    # A box is before the camera with all its corners, so with its centre too.
+    ahead = np.flatnonzero(moved[:, :3] @ T[2, :3] + T[2, 3] > _NEAREST)
+    uvw = box_corners(moved[ahead]) @ T[:, :3].T + T[:, 3]
     before = (uvw[..., 2] > _NEAREST).all(1)
     uv = uvw[..., :2] / np.maximum(uvw[..., 2:], _NEAREST)
     whole = np.concatenate([uv.min(1), uv.max(1)], axis=1)
@@ -97,7 +98,9 @@ def image_boxes(
     cut = np.clip(whole, 0.0, edges)
     area = np.prod(whole[:, 2:] - whole[:, :2], axis=1)
     inside = np.prod(cut[:, 2:] - cut[:, :2], axis=1)
-    return cut, before & (inside > 0.25 * area) & (inside > 1.0)
+    image, seen = np.zeros((len(moved), 4)), np.zeros(len(moved), bool)
+    image[ahead], seen[ahead] = cut, before & (inside > 0.25 * area) & (inside > 1.0)
+    return image, seen
 
 
 def _overlaps(a: np.ndarray, b: np.ndarray) -> np.ndarray:
