@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from ..card import DecodeSpec, HeadCard, InputSpec, OutputSpec, file_sha256, save_card
+from ..onnx_file import stamp
 from .network import HEAD_CLASSES, REGRESSION, STRIDE, UNFOLD, PillarCenterNet
 
 __all__ = ["export_head"]
@@ -31,7 +32,7 @@ def export_head(
     measured: dict[str, Any] | None = None,
     description: str = "",
 ) -> Path:
-    """Writes `name`.onnx (float32, batch norms folded, fixed shape) and `name`.yaml.
+    """Writes `name`.onnx (float32, batch norms folded, fixed shape, the classes in its metadata) and `name`.yaml.
 
     Args:
         network: In any state; exported in evaluation mode.
@@ -68,6 +69,7 @@ def export_head(
             output_names=["maps"],
             dynamo=False,
         )
+    model.write_bytes(stamp(model.read_bytes(), classes=",".join(HEAD_CLASSES)))
     card = HeadCard(
         name=name,
         description=description,

@@ -140,6 +140,7 @@ def test_fewer_channels_and_a_further_branch_learn_too(tmp_path, frames_folder):
         result.network, tmp_path / "head", point_range=(-8, -8, -2, 8, 8, 6), training={}, overlap_weight=0.5
     )
     card, model = load_card(path)
+    assert b"vehicle,pedestrian,cyclist,cone,barrier" in model.read_bytes()
     assert card.input.channels == LEAN_CHANNELS
     assert card.input.shape == (1, 16, 64, 64)
     assert card.output.regression == (*REGRESSION, "iou")
