@@ -43,9 +43,9 @@ _NUSCENES_CLASSES = {
     "traffic_cone": CONE,
     "barrier": BARRIER,
 }
-_RANGE_LABELS = {  # name: cars, all vehicles, height of the sensor [m]
-    "semantic_kitti": ((1,), (1, 4, 5), _KITTI_HEIGHT),
-    "nuscenes": ((7,), (7, 8, 9), _NUSCENES_HEIGHT),
+_RANGE_LABELS = {  # name: cars, all vehicles, no label, height of the sensor [m]
+    "semantic_kitti": ((1,), (1, 4, 5), 0, _KITTI_HEIGHT),
+    "nuscenes": ((7,), (7, 8, 9), 10, _NUSCENES_HEIGHT),
 }
 _HELD_OUT = 1_000_000
 """Simulator seeds from here on are trained on."""
@@ -248,7 +248,7 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
     name = options.get("labels", str, "semantic_kitti")
     if name not in _RANGE_LABELS:
         raise ConfigError(f"{uri}: labels must be one of {', '.join(_RANGE_LABELS)}, not {name!r}")
-    cars, vehicles, usual = _RANGE_LABELS[name]
+    cars, vehicles, nothing, usual = _RANGE_LABELS[name]
     root = pathlib.Path(place).expanduser()
     paths = sorted(root.glob("*.npz"))
     if not paths:
@@ -270,5 +270,7 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
             types=(),
             counts=np.empty(0, np.int64),
             velocities=np.empty((0, 2)),
-            point_labels=PointLabels(car=np.isin(labels, cars), vehicle=np.isin(labels, vehicles), known=labels > 0),
+            point_labels=PointLabels(
+                car=np.isin(labels, cars), vehicle=np.isin(labels, vehicles), known=labels != nothing
+            ),
         )

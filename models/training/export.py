@@ -100,7 +100,7 @@ def export_head(
             score_threshold=score_threshold,
             nms_iou=0.2,
             overlap_weight=overlap_weight,
-            max_candidates=1024,
+            max_candidates=2048,
             max_objects=256,
         ),
         training=training,
