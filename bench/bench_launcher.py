@@ -17,8 +17,13 @@ import yaml
 from warploom.bench.contest import peer, record_figure
 
 COMMAND = "from warploom.cli import main; main()"
-IDLE_S = 20.0
+IDLE_S = 10.0
 KILLS = 5
+REFERENCE = {"hw": "hw50", "lidar": "pandar90", "camera": "13", "radar": "conti430"}
+PEAK = """
+peak = next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM"))
+import os, time; times = os.times(); sys.stderr.write(f"USED {peak} {times.user + times.system}")
+"""
 MODULE = """\
 module: {name}
 components:
@@ -186,3 +191,33 @@ def bench_start_and_respawn(benchmark, node):
     note = f"median of {KILLS}"
     record_figure(benchmark, "death noticed after kill -9", np.median(told) * 1e3, "ms", note=note)
     record_figure(benchmark, "kill -9 to running again, back-off 0", np.median(back), "s", note=note)
+
+
+def used_by(arguments, folder):
+    """The peak of resident memory [MiB] and the CPU time [s] of a command, in a process of its own."""
+    code = f"import sys; from warploom.cli import main; sys.argv = ['warploom', *{arguments!r}]\n"
+    code += f"try:\n    main()\nexcept SystemExit as ended:\n    assert not ended.code\n{PEAK}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, check=True)
+    peak, cpu = done.stderr.rpartition("USED ")[2].split()
+    return int(peak) / 1024, float(cpu)
+
+
+@pytest.mark.slow
+def bench_check(benchmark, tmp_path):
+    """What `--check` of the reference node costs: classes are imported, nothing is compiled."""
+    arguments = ["launch", "--check", *(f"--{key}={value}" for key, value in REFERENCE.items())]
+    used = []
+    benchmark.extra_info.update(kernel="launcher", on="reference node")
+    benchmark.pedantic(lambda: used.append(used_by(arguments, tmp_path)), rounds=3)
+    cpu = min(cpu for _, cpu in used)
+    record_figure(benchmark, "launch --check of the reference node", cpu, "s of CPU", goal=3.0, note="least of 3")
+
+
+@pytest.mark.slow
+def bench_memory_of_cpu_min(benchmark, tmp_path):
+    """The peak of resident memory of the demo with the smallest profile."""
+    arguments = ["demo", "--profile", "cpu-min", "--seconds", "3", "--out", str(tmp_path / "out")]
+    used = []
+    benchmark.extra_info.update(kernel="launcher", on="demo, 3 s")
+    benchmark.pedantic(lambda: used.append(used_by(arguments, tmp_path)), rounds=1)
+    record_figure(benchmark, "demo with cpu-min, peak of resident memory", used[0][0], "MiB", goal=1024.0)
