@@ -7,6 +7,9 @@ the folder `--keep`.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -26,10 +29,18 @@ def _run(file: Path, keep: Path, seconds: float, limit: float) -> str:
     options = ("only", f"max-time={seconds}", "columns=median,iqr,rounds", "sort=name", f"json={written}")
     command = [sys.executable, "-m", "pytest", str(file), *(f"--benchmark-{option}" for option in options)]
     with (keep / f"{file.stem}.log").open("w") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
         try:
-            code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, timeout=limit, check=False).returncode
+            code = process.wait(limit)
         except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)  # pytest then writes what it has measured
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(30)
             return f"took more than {limit:g} s"
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # and what it started
+            process.wait()
     return "" if code == 0 else f"pytest ended with {code}; see {log.name}"
 
 
