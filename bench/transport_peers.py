@@ -6,6 +6,7 @@ import ctypes
 import multiprocessing
 import os
 import socket
+import subprocess
 import sys
 import tempfile
 import threading
@@ -13,7 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import shared_memory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,13 +23,13 @@ from warploom.dag.launch.linking import LinkPlan, Links
 from warploom.datamesh import CommitPolicy, DataMesh, Input, Output, Status
 from warploom.datamesh.transport import SharedMemoryConfig, ZenohConfig
 
-__all__ = ["WAYS", "send_all"]
+__all__ = ["WAYS", "BareMessage", "send_all"]
 
 Times = list[tuple[int, int]]
 
 STAMPS = 2  # int64 at the beginning of the data: when they were published, when they were begun
 KEPT = 4  # data that a reader keeps
-PATIENCE = 60.0  # [s] for a child to be there
+PATIENCE = 20.0  # [s] for a child to be there
 now = time.perf_counter_ns
 
 
@@ -76,6 +77,7 @@ class Warploom(Way):
     """A topic of the mesh, whose payload is built in place, to a component that runs for it."""
 
     remote: str | None = None
+    hand_off: Literal["thread", "inline"] = "thread"
 
     def __init__(self, name: str, size: int, queue: Any) -> None:
         self._mesh = DataMesh(KEPT)
@@ -131,7 +133,7 @@ class Warploom(Way):
         mesh = DataMesh(KEPT)
         component = Receiver("receiver")
         component.bind(mesh, {"data": "data"})
-        component.set_trigger("data", BacklogConfig(policy="fifo", depth=KEPT - 2))
+        component.set_trigger("data", BacklogConfig(policy="fifo", depth=KEPT - 2), cls.hand_off)
         component.start()
         sys.setswitchinterval(100e-6)  # as a process does
         links = cls.links(mesh, name, imports=("data",))
@@ -142,6 +144,12 @@ class Warploom(Way):
         links.stop()
         component.stop()
         return times
+
+
+class WarploomInline(Warploom):
+    """The same to a component that runs in the thread that receives: `hand_off: inline`."""
+
+    hand_off = "inline"
 
 
 class WarploomZenoh(Warploom):
@@ -341,6 +349,7 @@ def _port(name: str) -> int:
 
 WAYS: dict[str, type[Way]] = {
     "warploom": Warploom,
+    "warploom, inline": WarploomInline,
     "warploom over zenoh": WarploomZenoh,
     "multiprocessing.Queue": Queue,
     "zenoh": Zenoh,
@@ -373,8 +382,43 @@ def _child(way: str, name: str, size: int, count: int, queue: Any) -> Iterator[t
         here.close()
 
 
-def send_all(way: str, size: int, count: int, every_s: float) -> np.ndarray:
-    """Sends data by one way to a child.
+class BareMessage:
+    """A message of 64 bytes of a Unix socket to a process that waits for it: what this machine takes, and no less."""
+
+    RECEIVER = """
+import socket, sys, time
+one = socket.socket(fileno=int(sys.argv[1]))
+times = []
+while data := one.recv(64):
+    times.append(time.perf_counter_ns() - int.from_bytes(data[:8], "little"))
+one.send(b"".join(time.to_bytes(8, "little") for time in times))
+"""
+
+    def __init__(self) -> None:
+        """Starts the process."""
+        self._socket, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        fd = there.fileno()
+        self._process = subprocess.Popen([sys.executable, "-S", "-E", "-c", self.RECEIVER, str(fd)], pass_fds=(fd,))
+        there.close()
+
+    def send(self) -> None:
+        """Sends one."""
+        self._socket.send(now().to_bytes(8, "little") + bytes(56))
+
+    def end(self) -> np.ndarray:
+        """How long each took until the receiver's next line [ns]."""
+        self._socket.shutdown(socket.SHUT_WR)
+        return np.frombuffer(self._socket.recv(1 << 20), np.int64)
+
+    def close(self) -> None:
+        """Ends the process, whatever it does."""
+        self._socket.close()
+        self._process.kill()
+        self._process.wait()
+
+
+def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sends data by one way to a child, and between them bare messages to another.
 
     Args:
         way: Of `WAYS`.
@@ -383,8 +427,8 @@ def send_all(way: str, size: int, count: int, every_s: float) -> np.ndarray:
         every_s: Time from one to the next, in which the receiver goes to sleep [s].
 
     Returns:
-        For each, from its publication to the start of the receiver's code, and from before it was written to there
-        [ns]; shape (count, 2), int64.
+        For each that came, from its publication to the start of the receiver's code, and from before it was written to
+        there [ns], shape (n, 2), int64; and what the bare messages took [ns], shape (count,), int64.
 
     Raises:
         TimeoutError: The child does not come, or data are missing.
@@ -392,20 +436,27 @@ def send_all(way: str, size: int, count: int, every_s: float) -> np.ndarray:
     name = f"warploom-bench-{os.getpid()}{now() % 10**6:06d}"
     queue = multiprocessing.get_context("spawn").Queue()
     source = np.arange(size // 8)
-    sender = WAYS[way](name, size, queue)
+    bare = BareMessage()
+    sender = None
     try:
+        sender = WAYS[way](name, size, queue)
         with _child(way, name, size, count, queue) as (ready, result):
             if not ready.wait(PATIENCE):
                 raise TimeoutError(f"{way}: the receiver is not there after {PATIENCE} s")
             for number in range(count):
-                time.sleep(every_s)
+                time.sleep(every_s / 2)
+                bare.send()
+                time.sleep(every_s / 2)
                 source[-1] = number
                 sender.send(source)
             if not result.poll(PATIENCE):
                 raise TimeoutError(f"{way}: not all of {count} data of {size} bytes have arrived")
-            return np.array(result.recv(), np.int64).reshape(-1, 2)
+            times = result.recv()
+        return np.array(times, np.int64).reshape(-1, 2), bare.end()
     finally:
-        sender.close()
+        bare.close()
+        if sender is not None:
+            sender.close()
         queue.cancel_join_thread()  # what nobody has read is not waited for
         queue.close()
         with suppress(FileNotFoundError):

@@ -307,8 +307,9 @@ class Links:
         """What was sent and received so far, by topic.
 
         Of exports: commits, sent, sent_bytes (of messages, not of slabs), copied and copied_bytes (payloads that were
-        not built in shared memory), slow, no_memory and not_encodable (what was dropped), readers, connections,
-        disconnections, slabs (in use). Of imports: received, received_bytes, missed, damaged, connections, connected.
+        not built in shared memory), slow, no_memory and not_encodable (what was dropped), kept (for readers that were
+        killed) and away (of that, what was dropped), readers, connections, disconnections, slabs (in use). Of imports:
+        received, received_bytes, missed, damaged, connections, connected.
         """
         with self._lock:
             exports = {topic: tuple(links) for topic, links in self._exports.items()}

@@ -18,6 +18,12 @@ class SharedMemoryConfig(BaseModel):
     """How many payloads a reader may have in its queue, beside those that its window keeps."""
     history: int = Field(8, ge=0, le=1024)
     """How many of the newest data a reader is sent that connects later."""
+    kept: int = Field(64, ge=0, le=1 << 16)
+    """How many data are kept for a reader that was killed, until it is back."""
+    kept_bytes: int = Field(1 << 28, ge=0)
+    """How much memory they may take together, about [B]."""
+    kept_s: float = Field(10.0, ge=0.0)
+    """For how long [s]."""
     retry_ms: float = Field(20.0, gt=0.0)
     """How long a reader waits before it looks for its producer again [ms]."""
 

@@ -13,7 +13,7 @@ import os
 import select
 import socket
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -25,9 +25,22 @@ from ..messages import encode
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
+from .keeping import Absent, Kept
 from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
 from .slabs import Lease, Slab, SlabArena, SlabPool, Usage
-from .wire import COMMIT, INLINE, MESSAGE, RELEASE, SETTLE, Event, new_event, pack_event, pack_greeting, read_greeting
+from .wire import (
+    COMMIT,
+    INLINE,
+    LEAVES,
+    MESSAGE,
+    RELEASE,
+    SETTLE,
+    Event,
+    new_event,
+    pack_event,
+    pack_greeting,
+    read_greeting,
+)
 
 __all__ = ["ExportService", "Exporter"]
 
@@ -90,7 +103,20 @@ class ExportService:
 class _Reader:
     """A connection to a process that reads the topic."""
 
-    __slots__ = ("blocks", "held", "most", "name", "number", "reached", "send", "slabs", "socket")
+    __slots__ = (
+        "blocks",
+        "flight",
+        "held",
+        "kept",
+        "leaves",
+        "most",
+        "name",
+        "number",
+        "reached",
+        "send",
+        "slabs",
+        "socket",
+    )
 
     def __init__(self, connection: socket.socket, name: str, most: int, blocks: bool) -> None:
         self.socket = connection
@@ -106,6 +132,19 @@ class _Reader:
         self.held = 0
         self.slabs: Counter[int] = Counter()
         """Those that it holds, by offset, and how often."""
+        self.flight: deque[Entry] = deque()
+        """What it was sent last, and may not have read."""
+        self.kept: Kept | None = None
+        """What was kept for it while it was away, and what was committed since; None once it has caught up."""
+        self.leaves = False
+        """It has said so; otherwise it was killed."""
+
+    def has_sent(self, entry: Entry, epoch: int, in_slabs: bool) -> None:
+        """Notes what it was sent, for when it is killed; what it has let go of, it has read."""
+        self.reached = max(self.reached, (epoch, entry.version))
+        self.flight.append(entry)
+        while len(self.flight) > (self.held if in_slabs else self.most):
+            self.flight.popleft()
 
 
 class _NoRoom(Exception):  # noqa: N818  (it is no error: the datum is dropped and counted)
@@ -196,6 +235,8 @@ class Exporter:
         self._stopped = False
         self._built = self._copied = Usage()
         self._newest = self._newest_of(window)
+        self._absent = Absent(self._config, self._on_lost)
+        self._behind: list[_Reader] = []
         self._listener = listen(node, window.topic)
         try:
             self.order = OrderFile(node, window.topic)
@@ -214,11 +255,12 @@ class Exporter:
         if self._lock.acquire(timeout=_COUNTING_S):  # held for long where a commit waits for a reader that blocks
             try:
                 self._collect_all()
+                self._absent.tidy()
                 self._pool.collect()
             finally:
                 self._lock.release()
         counts = {"commits": 0, "sent": 0, "copied": 0, **self._counts}
-        return {**counts, "readers": len(self._readers), "slabs": self._pool.used}
+        return {**counts, "readers": len(self._readers), "slabs": self._pool.used, "kept": len(self._absent)}
 
     def stop(self) -> None:
         """Ends the export. What readers hold stays theirs."""
@@ -251,6 +293,8 @@ class Exporter:
                 return None
             self._collect_all()
             slab = self._pool.take(size)
+            while slab is None and self._absent.make_room():
+                slab = self._pool.take(size)
             return None if slab is None else self._pool.lease(slab)
 
     def _count(self, what: str) -> None:
@@ -269,8 +313,14 @@ class Exporter:
             newest = order > self._newest or self._window.snapshot().versions[-1] == version
             if newest:
                 self._newest = order
-            if self._readers:
-                self._tell(entry, epoch, newest, self._readers)
+            if self._absent:
+                self._absent.add(entry, self._size)
+            readers = self._readers
+            if self._behind:
+                readers = [reader for reader in readers if reader.kept is None]
+                self._put_behind(entry)
+            if readers:
+                self._tell(entry, epoch, newest, readers)
             self._counts["commits"] += 1
 
     def _on_settle(self, version: int, epoch: int) -> None:
@@ -284,20 +334,28 @@ class Exporter:
 
     def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]) -> None:
         """Sends a datum to readers."""
+        encoded = self._encoded(entry, epoch, newest, readers)
+        if encoded is None:
+            return
+        event, slabs, leases = encoded
+        for reader in tuple(readers):
+            if self._send(reader, event, slabs):
+                reader.has_sent(entry, epoch, bool(slabs))
+        del leases  # until here they hold the slabs that were copied to
+
+    def _encoded(
+        self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]
+    ) -> tuple[Event, list[Slab], list[Lease]] | None:
+        """What `_encode` gives; None where it fails, which is counted for the readers."""
         try:
-            event, slabs, leases = self._encode(entry, epoch, newest)
+            return self._encode(entry, epoch, newest)
         except _NoRoom:
             self._lose("no_memory", entry.version, readers)
-            return
         except (TypeError, ValueError) as error:
             if not self._counts["not_encodable"]:
                 _log.warning("%s: version %d is not sent: %s", self._window.topic, entry.version, error)
             self._lose("not_encodable", entry.version, readers)
-            return
-        for reader in tuple(readers):
-            if self._send(reader, event, slabs):
-                reader.reached = max(reader.reached, (epoch, entry.version))
-        del leases  # until here they hold the slabs that were copied to
+        return None
 
     def _lose(self, reason: str, version: int, readers: list[_Reader]) -> None:
         for reader in readers:
@@ -380,9 +438,15 @@ class Exporter:
             for other in tuple(self._readers):
                 if other.name == reader.name:  # if it is its life before, it is to be noticed first
                     self._collect(other)
-            self._service.watch(connection, select.EPOLLRDHUP, lambda: self._gone(reader))
+            self._service.watch(connection, select.EPOLLRDHUP, lambda: self._serve(reader))
             self._readers.append(reader)
-            self._send_history(reader)
+            reader.kept = self._absent.returns(reader.name)
+            if reader.kept is None:
+                self._send_history(reader)
+            else:
+                self._behind.append(reader)
+                self._reached.pop(reader.name, None)
+                self._catch_up(reader)
 
     def _send_history(self, reader: _Reader) -> None:
         """Sends what a new reader has missed; it triggers, unless it was sent to the reader's life before."""
@@ -395,9 +459,84 @@ class Exporter:
             self._tell(entry._replace(triggers=triggers), epoch, False, [reader])
         reader.reached = max(reader.reached, reached)
 
-    def _gone(self, reader: _Reader) -> None:
+    def _serve(self, reader: _Reader) -> None:
         with self._lock:
             self._collect(reader)
+            if reader.kept is not None:
+                self._catch_up(reader)
+
+    # Readers that were away
+
+    @property
+    def _size(self) -> int:
+        """What a payload takes, as far as that is known [B]."""
+        return max(self._built.size, self._copied.size)
+
+    def _on_lost(self, entry: Entry) -> None:
+        self._counts["away"] += 1
+        self._window.losses.count(self._window.topic, "link_away", entry.version)
+
+    def _keep_for(self, reader: _Reader) -> None:
+        """From here on data are kept for a reader that was killed, beginning with what it may not have read."""
+        entries = {(entry.epoch, entry.version): (entry, True) for entry in reader.flight}
+        for entry, sent in reader.kept.entries if reader.kept is not None else ():
+            entries.setdefault((entry.epoch, entry.version), (entry, sent))
+        snapshot = self._window.snapshot()
+        for index in range(len(snapshot)):
+            entry = snapshot.entry(index)
+            sent = (self.order.epoch(entry.epoch, entry.version), entry.version) <= reader.reached
+            entries.setdefault((entry.epoch, entry.version), (entry, sent))
+        self._absent.leaves(reader.name, [entries[order] for order in sorted(entries)])
+
+    def _put_behind(self, entry: Entry) -> None:
+        """A commit comes after what readers that catch up are still to be sent."""
+        for reader in tuple(self._behind):
+            if reader.kept is None:  # it has ended meanwhile
+                continue
+            most = len(reader.kept.entries) + 1 if reader.blocks else self._absent.most(self._size)
+            for lost in reader.kept.add(entry, most):
+                self._on_lost(lost)
+            self._catch_up(reader)
+
+    def _catch_up(self, reader: _Reader) -> None:
+        """Sends what was kept for a reader, as far as there is room; one that blocks its producer is waited for."""
+        while (kept := reader.kept) is not None and kept.entries:
+            if reader.held >= reader.most:
+                self._collect(reader)
+            if reader.socket.fileno() < 0:
+                return
+            if reader.held < reader.most and self._send_kept(reader, *kept.entries[0]):
+                kept.entries.popleft()
+            elif reader.socket.fileno() < 0:
+                return
+            elif reader.blocks and not self._stopped:
+                self._wait_for(reader, full=reader.held >= reader.most)
+            else:
+                wanted = select.EPOLLOUT if reader.held < reader.most else 0
+                self._service.watch(
+                    reader.socket, select.EPOLLIN | select.EPOLLRDHUP | wanted, lambda: self._serve(reader)
+                )
+                return
+        if reader in self._behind:
+            self._behind.remove(reader)
+            reader.kept = None
+            self._service.watch(reader.socket, select.EPOLLRDHUP, lambda: self._serve(reader))
+
+    def _send_kept(self, reader: _Reader, entry: Entry, sent: bool) -> bool:
+        """Sends a datum again, or late; tells whether it is done with."""
+        epoch = self.order.epoch(entry.epoch, entry.version)
+        entry = entry._replace(triggers=entry.triggers and not sent)
+        encoded = self._encoded(entry, epoch, False, [reader])
+        if encoded is None:
+            return True
+        event, slabs, _leases = encoded
+        if not self._try_send(reader, pack_event(event, reader.number + 1), slabs):
+            return False
+        reader.number += 1
+        reader.has_sent(entry, epoch, bool(slabs))
+        return True
+
+    # Messages
 
     def _send(self, reader: _Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
         """Sends an event, if the reader has room; one that blocks its producer is waited for. Tells whether it did."""
@@ -410,12 +549,15 @@ class Exporter:
                 self._counts["slow"] += 1
                 self._window.losses.count(self._window.topic, "link_slow", event.version)
                 return False
-            poll = select.poll()
-            poll.register(
-                reader.socket, select.POLLIN | (0 if slabs and reader.held >= reader.most else select.POLLOUT)
-            )
-            poll.poll(50)
+            self._wait_for(reader, full=bool(slabs) and reader.held >= reader.most)
         return True
+
+    @staticmethod
+    def _wait_for(reader: _Reader, full: bool) -> None:
+        """Waits until a reader has let go of something, or takes another message where it is not full."""
+        poll = select.poll()
+        poll.register(reader.socket, select.POLLIN | (0 if full else select.POLLOUT))
+        poll.poll(50)
 
     def _try_send(self, reader: _Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
         if slabs and reader.held >= reader.most:
@@ -457,6 +599,8 @@ class Exporter:
             for (offset,) in RELEASE.iter_unpack(data[: len(data) // RELEASE.size * RELEASE.size]):
                 if reader.slabs[offset] > 0:  # what it does not hold, it cannot let go of
                     self._let_go(reader, offset, 1)
+                elif offset == LEAVES:
+                    reader.leaves = True
 
     def _let_go(self, reader: _Reader, offset: int, times: int) -> None:
         slab = self._pool.at(offset)
@@ -464,6 +608,8 @@ class Exporter:
         if not reader.slabs[offset]:
             del reader.slabs[offset]
         reader.held -= times
+        while len(reader.flight) > reader.held:
+            reader.flight.popleft()
         for _ in range(times):
             self._pool.release(slab)
 
@@ -473,6 +619,12 @@ class Exporter:
             return
         self._readers.remove(reader)
         reader.socket.close()
+        if not reader.leaves and not self._stopped:
+            self._keep_for(reader)
+        reader.flight.clear()  # who waits for its socket may know it for longer
+        reader.kept = None
+        if reader in self._behind:
+            self._behind.remove(reader)
         self._reached[reader.name] = max(reader.reached, self._reached.pop(reader.name, reader.reached))
         if len(self._reached) > _NAMES:
             del self._reached[next(iter(self._reached))]

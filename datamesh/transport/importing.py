@@ -25,7 +25,7 @@ from ..window import Window
 from .config import SharedMemoryConfig
 from .places import connect, peer_of
 from .slabs import Lease, Region
-from .wire import MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
+from .wire import LEAVES, MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
 
 __all__ = ["Importer", "publish"]
 
@@ -121,6 +121,8 @@ class Importer:
         with self._lock:
             if self._socket is not None:
                 with suppress(OSError):
+                    if self._connection is not None:
+                        self._socket.send(RELEASE.pack(LEAVES), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
                     self._socket.shutdown(socket.SHUT_RDWR)
         if self._thread is not None:
             self._thread.join(_STOP_S)

@@ -2,6 +2,7 @@
 
 write NAME TOPIC FIRST BYTES PERIOD_MS COUNT   commits clouds of one number, its version, built in place
 read NAME TOPIC                                says of each that it gets whether it is whole
+note NAME TOPIC                                notes what is committed, as a recorder does
 relay NAME FROM TO                             commits to TO what it reads of FROM
 
 Where PEER_ZENOH holds a configuration, it does so over zenoh.
@@ -22,7 +23,7 @@ from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
 from warploom.datamesh.messages import message
 from warploom.datamesh.transport import SharedMemoryConfig, ZenohConfig
 
-CONFIG = SharedMemoryConfig(memory_bytes=1 << 28, retry_ms=2.0)
+CONFIG = SharedMemoryConfig(memory_bytes=1 << 28, retry_ms=2.0, kept=1 << 14, kept_s=600.0)
 
 
 @message("test.Whole")
@@ -94,12 +95,18 @@ def write(mesh, topic, first, size, period_ms, count):
 def main(node, kind, name, *arguments):
     """Does it until it is killed, or has written all."""
     mesh = DataMesh(8)
-    topics = {"write": (arguments[:1], ()), "read": ((), arguments[:1]), "relay": (arguments[1:], arguments[:1])}[kind]
+    read = (), arguments[:1]
+    topics = {"write": (arguments[:1], ()), "read": read, "note": read, "relay": (arguments[1:], arguments[:1])}[kind]
     zenoh = ZenohConfig.model_validate_json(os.environ["PEER_ZENOH"]) if "PEER_ZENOH" in os.environ else None
     remote = dict.fromkeys(arguments, "zenoh") if zenoh is not None else {}
     plan = LinkPlan(*topics, remote=remote)
     links = Links(mesh, plan, node=node, name=name, shared_memory=CONFIG, zenoh=zenoh)
-    if kind != "write":
+    if kind == "note":
+        mesh.window(arguments[0]).subscribe(
+            lambda entry: say(noted=entry.version, late=(time.monotonic_ns() - entry.committed_ns) / 1e9),
+            lambda *_: None,
+        )
+    elif kind != "write":
         component = (Reader if kind == "read" else Relay)(name)
         component.bind(mesh, dict(zip(("data", "result"), arguments, strict=False)))
         component.set_trigger("data", BacklogConfig(policy="fifo", depth=4))

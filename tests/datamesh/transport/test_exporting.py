@@ -52,6 +52,11 @@ def last(side, topic="topic"):
         return snapshot.last()
 
 
+def shown(side, topic="topic"):
+    with side.input(topic).access() as snapshot:
+        return list(snapshot)
+
+
 def test_a_payload_that_is_built_in_place_is_not_copied(linked):
     writer, reader = linked()
     arrays = []
@@ -333,8 +338,9 @@ class TestReaders:
         assert not thread.is_alive()
         assert writer.counts("topic")["readers"] == 0
 
-    def test_what_a_reader_held_is_free_when_it_ends(self, side):
-        writer = side("writer", exports=["topic"], capacity=1)
+    @pytest.mark.parametrize("kept_s", [0.0, 0.2])
+    def test_what_a_reader_held_is_free_when_it_is_not_back_in_time(self, side, kept_s):
+        writer = side("writer", exports=["topic"], capacity=1, kept_s=kept_s)
         client = connect("node", "topic")
         client.send(pack_greeting({"topic": "topic", "reader": "dies", "capacity": 8, "blocks": False}))
         writer.until(lambda counts: counts["readers"] == 1, "topic")
@@ -402,6 +408,142 @@ class TestReaders:
             client.settimeout(30)
             assert client.recv(MESSAGE) == b""
         assert writer.counts("topic")["readers"] == 0
+
+
+class Killed:
+    """A reader that ends without a word, as one does that is killed."""
+
+    def __init__(self, side, **options):
+        self._make = lambda: side("reader", imports=["topic"], **options)
+        self.side = self._make()
+
+    def kill(self, writer):
+        link = self.side.links._imports["topic"]
+        link._stopping.set()
+        link._socket.shutdown(socket.SHUT_RDWR)
+        writer.until(lambda counts: counts["readers"] == 0, "topic")
+
+    def back(self):
+        self.side = self._make()
+        return self.side
+
+
+class TestKilledReaders:
+    """What was committed while a reader was away is sent to it when it is back."""
+
+    def test_all_of_it_comes_in_order_and_triggers_once(self, side):
+        writer = side("writer", exports=["topic"], capacity=4, queue=2, history=2)
+        reader = Killed(side, capacity=4, queue=2)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        for version in range(1, 11):
+            writer.commit("topic", version, built(version))
+            until_shown(reader.side, version)
+        reader.kill(writer)
+        for version in range(11, 51):
+            writer.commit("topic", version, built(version))
+        back = reader.back()
+        until_shown(back, 50)
+        first = back.commits["topic"][0][1]
+        assert first <= 7, "what it may not have read comes again"
+        assert back.commits["topic"] == [(0, version, version > 10) for version in range(first, 51)]
+        assert all((cloud.xyz == v).all() for v, cloud in enumerate(shown(back), 47))
+        counts = writer.counts("topic")
+        assert counts.get("slow", 0) == counts.get("away", 0) == counts["kept"] == 0
+        writer.commit("topic", 51, built(51))
+        until_shown(back, 51)
+        assert back.commits["topic"][-1] == (0, 51, True)
+
+    def test_what_is_committed_while_it_catches_up_comes_behind(self, side):
+        writer = side("writer", exports=["topic"], capacity=2, queue=1)
+        reader = Killed(side, capacity=2, queue=1)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 31):
+            writer.commit("topic", version, built(version))
+        back = reader.back()
+        for version in range(31, 61):
+            writer.commit("topic", version, built(version))
+        until_shown(back, 60)
+        assert [version for _, version, _ in back.commits["topic"]] == list(range(1, 61))
+
+    def test_killed_while_it_catches_up_it_still_misses_nothing(self, side):
+        writer = side("writer", exports=["topic"], capacity=2, queue=1)
+        reader = Killed(side, capacity=2, queue=1)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 41):
+            writer.commit("topic", version, built(version))
+        with connect("node", "topic") as client:  # it reads some, and is killed
+            client.settimeout(30)
+            client.send(pack_greeting({"topic": "topic", "reader": "reader", "capacity": 2, "blocks": False}))
+            client.recv(MESSAGE)
+            seen = {read_event(client.recv(MESSAGE), 1 << 24).version for _ in range(3)}
+        writer.until(lambda counts: counts["readers"] == 0, "topic")
+        back = reader.back()
+        until_shown(back, 40)
+        assert seen == {1, 2, 3}
+        assert {version for _, version, _ in back.commits["topic"]} >= set(range(4, 41))
+
+    def test_too_much_is_lost_from_its_beginning_and_counted(self, side):
+        writer = side("writer", exports=["topic"], capacity=4, kept=10)
+        reader = Killed(side)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 31):
+            writer.commit("topic", version, built(version))
+        assert writer.counts("topic")["away"] == 20
+        assert writer.mesh.losses["topic", "link_away"] == 20
+        back = reader.back()
+        until_shown(back, 30)
+        assert [version for _, version, _ in back.commits["topic"]] == list(range(21, 31))
+
+    def test_its_size_is_bounded_too(self, side):
+        writer = side("writer", exports=["topic"], capacity=1, kept_bytes=5 * 12000)
+        reader = Killed(side)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 31):
+            writer.commit("topic", version, built(version, 1000))
+        assert writer.counts("topic")["kept"] <= 5
+        assert writer.counts("topic")["slabs"] <= 6
+
+    @pytest.mark.parametrize("options", [{"kept": 0}, {"kept_s": 0.0}])
+    def test_without_it_there_is_the_history(self, side, options):
+        writer = side("writer", exports=["topic"], capacity=4, history=2, **options)
+        reader = Killed(side)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 31):
+            writer.commit("topic", version, built(version))
+        back = reader.back()
+        until_shown(back, 30)
+        assert [version for _, version, _ in back.commits["topic"]] == [29, 30]
+        assert writer.counts("topic")["kept"] == 0
+
+    def test_for_who_says_good_bye_nothing_is_kept(self, side):
+        writer = side("writer", exports=["topic"])
+        reader = side("reader", imports=["topic"])
+        reader.until(lambda counts: counts["connected"], "topic")
+        reader.links.stop()
+        writer.until(lambda counts: counts["readers"] == 0, "topic")
+        writer.commit("topic", 1, built(1))
+        assert writer.counts("topic")["kept"] == 0
+
+    def test_memory_that_is_needed_is_not_kept(self, side):
+        writer = side("writer", exports=["topic"], capacity=1, memory_bytes=1 << 20, kept=1000)
+        reader = Killed(side, capacity=1, memory_bytes=1 << 20)
+        writer.until(lambda counts: counts["readers"] == 1, "topic")
+        reader.kill(writer)
+        for version in range(1, 101):
+            writer.commit("topic", version, built(version, 4000))
+        counts = writer.counts("topic")
+        assert counts["away"] > 0
+        assert counts["away"] + counts["kept"] == 100
+        assert counts["slabs"] <= 16
+        assert counts.get("no_memory", 0) == 0
+        back = reader.back()
+        until_shown(back, 100)
+        assert (last(back).xyz == 100).all()
 
 
 def test_the_memory_of_payloads_outlives_the_export(linked):

@@ -119,7 +119,22 @@ def kill_relays(peer, times):
     assert last.process.poll() is None
 
 
-CAMPAIGNS = {"writer": kill_writers, "reader": kill_readers, "relay": kill_relays}
+def kill_recorders(peer, times):
+    """What is committed while the one that notes it is dead is kept for it: all is noted, in one of its lives."""
+    peer("write", "writer", "cloud", 1, 8_000, 20, 1_000_000)
+    noted = set()
+    for life in range(times + 1):
+        recorder = peer("note", "recorder", "cloud")
+        got = [recorder.wait_for("noted") for _ in range(5)]
+        while got[-1]["late"] > 1.0 and (life % 3 == 0 or life == times):  # the others die before they have caught up
+            got.append(recorder.wait_for("noted"))
+        time.sleep(0.001 * (life % 7))
+        recorder.kill()
+        noted |= {one["noted"] for one in (*got, *recorder.rest())}
+    assert noted == set(range(min(noted), max(noted) + 1))
+
+
+CAMPAIGNS = {"writer": kill_writers, "reader": kill_readers, "relay": kill_relays, "recorder": kill_recorders}
 
 
 @pytest.mark.parametrize("who", CAMPAIGNS)
