@@ -312,6 +312,9 @@ def play_recording(
         SourceError: The recording cannot be read.
         SinkError: The new recording cannot be created.
     """
+    if profile is None and (settings or device is not None):
+        what = "--set" if settings else "--device"
+        raise ConfigError(f"{what} changes nothing without --profile: a recording alone is published as it is")
     recording = Recording(path)
     known, versions = _held_by(recording)
     with ExitStack() as stack:
@@ -328,11 +331,11 @@ def play_recording(
         played = list(topics) or [
             topic for topic in known if topic not in produced and not topic.startswith("warploom/")
         ]
-        reached = [last - first for topic in played for first, last in [versions[topic]]]
-        if seek and reached and max(reached) < seek * 1e9:
-            raise ConfigError(
-                f"{path}: --seek {seek:g} is beyond its end, {max(reached) / 1e9:.1f} s after its beginning"
-            )
+        span = max((versions[topic][1] for topic in played), default=0) - min(
+            (versions[topic][0] for topic in played), default=0
+        )
+        if played and span < seek * 1e9:
+            raise ConfigError(f"{path}: --seek {seek:g} is beyond its end, {span / 1e9:.2f} s after its beginning")
         drain = Drain(process, played) if process is not None else None
         recorder = None
         if record is not None:

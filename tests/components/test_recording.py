@@ -1,5 +1,6 @@
 """The pipeline recorded, played and replayed: every commit again to the bit, on any number of workers."""
 
+import dataclasses
 import errno
 import json
 import re
@@ -9,7 +10,7 @@ import pytest
 
 import warploom as wl
 from warploom.components.messages import Obstacles, PointLabels, SensorFrame
-from warploom.components.pipeline import LIDAR_TOPIC, OBSTACLES_TOPIC, POINTS_TOPIC
+from warploom.components.pipeline import CAMERAS_TOPIC, LIDAR_TOPIC, OBSTACLES_TOPIC, POINTS_TOPIC, RADARS_TOPIC
 from warploom.components.recording import play_recording, record_source, replay_lines, replay_recording
 from warploom.datamesh import recording as recording_module
 from warploom.datamesh.messages import encode
@@ -18,6 +19,7 @@ from warploom.errors import ConfigError, SourceError
 
 SOURCE = "sim:street?seed=7&duration=1.0"
 WORKERS = (1, 2, 8)
+SOURCES = (CAMERAS_TOPIC, LIDAR_TOPIC, RADARS_TOPIC)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +27,7 @@ def street(tmp_path_factory):
     """The main job on one second of the simulator, recorded."""
     path = tmp_path_factory.mktemp("recording") / "street.mcap"
     summary = record_source(SOURCE, path, settings=["perception.cluster.min_size=9"])
-    assert (summary.frames, summary.commits, summary.dropped, summary.failure) == (10, 40, {}, None)
+    assert (summary.frames, summary.commits, summary.dropped, summary.failure) == (10, 60, {}, None)
     assert summary.losses == {}
     return path
 
@@ -60,7 +62,7 @@ def test_the_main_job_replays_with_equal_hashes_at_1_2_and_8_workers(street):
     assert [workers for workers, _, _ in results] == list(WORKERS)
     for _, result, changed in results:
         assert result.good, result.differences
-        assert result.fed == {LIDAR_TOPIC: 10}
+        assert result.fed == dict.fromkeys(SOURCES, 10)
         assert result.equal == {"perception/detected": 10, POINTS_TOPIC: 10, OBSTACLES_TOPIC: 10}
         assert changed == []
 
@@ -68,9 +70,9 @@ def test_the_main_job_replays_with_equal_hashes_at_1_2_and_8_workers(street):
 def test_under_loop_and_seek_too(street, tmp_path):
     settings = ["perception.cluster.min_size=9"]
     summary = play_recording(
-        street, profile="cpu", settings=settings, rate=None, seek=0.45, loops=2, record=tmp_path / "looped.mcap"
+        street, profile="cpu", settings=settings, rate=None, seek=0.5, loops=2, record=tmp_path / "looped.mcap"
     )
-    assert summary.published == {LIDAR_TOPIC: 10}
+    assert summary.published[LIDAR_TOPIC] == 10  # from 0.45 s on: a camera is the first, 0.05 s before the sweep
     assert summary.recorded.dropped == summary.recorded.losses == {}
     epochs = [(event.epoch, event.topic) for event in Recording(tmp_path / "looped.mcap")]
     assert [epochs.count((epoch, OBSTACLES_TOPIC)) for epoch in (0, 1)] == [5, 5]
@@ -162,3 +164,20 @@ def test_topics_and_files_that_make_no_sense_are_refused(street, tmp_path):
         play_recording(street, record=street)
     with pytest.raises(SourceError, match="No such file"):
         list(replay_recording(tmp_path / "absent.mcap"))
+
+
+def test_a_seek_beyond_the_end_is_told(street):
+    with pytest.raises(ConfigError, match=r"--seek 7 is beyond its end, 0\.95 s after its beginning"):
+        play_recording(street, rate=None, seek=7.0)
+
+
+def test_a_replay_tells_which_messages_have_other_fields(street):
+    ((_, result, _),) = replay_recording(street)
+    lines = replay_lines(None, dataclasses.replace(result, other_fields=("perception/points",)), [])
+    assert any("perception/points: its message has other fields" in line for line in lines)
+
+
+@pytest.mark.parametrize(("options", "said"), [({"settings": ["a=3"]}, "--set"), ({"device": "cpu"}, "--device")])
+def test_what_changes_nothing_is_refused(tmp_path, options, said):
+    with pytest.raises(ConfigError, match=f"{said} changes nothing without --profile"):
+        play_recording(tmp_path / "a.mcap", **options)
