@@ -28,8 +28,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .
 
 bench: $(VENV)/.bench
-	$(BIN)/python -m pytest bench --benchmark-only --benchmark-max-time=0.4 --benchmark-columns=median,iqr,rounds --benchmark-sort=name --benchmark-json=benchmark.json
-	$(BIN)/python -m warploom.bench.report benchmark.json --out docs/benchmarks.md
+	$(BIN)/python -m warploom.bench --out docs/benchmarks.md
 
 # Reproduces the shipped detection head; hours on two cores, see models/training/.
 train: $(VENV)/.dev
