@@ -1,10 +1,10 @@
 """Fusion: what the LiDAR found, with what cameras and radars saw a little earlier, as objects that are sure to exist.
 
 The LiDAR's detections are joined by the latest of each camera and radar before they are tracked: a camera's object
-that overlaps a detection in the image makes it surer and votes on its class, and gives a class to a cluster; a radar's
-target in or beside it makes it surer, and its radial speed goes into the filter, from birth on. So what is too faint
-for the LiDAR alone begins a track where another sensor agrees. Moving targets are tracked by themselves too, stand in
-for what the LiDAR does not see, and share the ids of its tracks.
+that overlaps a detection in the image makes it surer and votes on its class, and makes a person or a rider of a
+cluster; a radar's target in or beside it makes it surer, and its radial speed goes into the filter, from birth on. So
+what is too faint for the LiDAR alone begins a track where another sensor agrees. Moving targets are tracked by
+themselves too, stand in for what the LiDAR does not see, and share the ids of its tracks.
 
 Existence is a Bayesian filter for each object, in log-odds: what was and was not seen, by sensors that are taken to err
 independently of each other, with a memory that fades. So is the class, as a probability of each.
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .classes import CLASSES, UNKNOWN, VEHICLE
+from .classes import CLASSES, CYCLIST, PEDESTRIAN, UNKNOWN, VEHICLE
 from .fusion_sensors import (
     CameraView,
     RadarView,
@@ -39,6 +39,9 @@ _SUREST = 6.0  # log-odds: beyond, an object that is gone would stay for seconds
 _FORGET_NS = 5_000_000_000
 _MANY_NAMES = 4096
 _RADAR_SIZE = (4.4, 1.9, 1.6)  # of what only a radar has seen [m]
+# The longer side of what a camera can make of a cluster [m]. People and riders are one cluster each; of a vehicle a
+# cluster is a side or a corner, which as an object of its own would be a second one beside the true one.
+_WHOLE = {PEDESTRIAN: (0.2, 1.3), CYCLIST: (0.8, 2.4)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +110,7 @@ class FusedObjects:
     existence: np.ndarray
     """Probability that the object exists, shape (k,), float64."""
     background: np.ndarray
-    """True for clusters that no camera has given a class, shape (k,), bool."""
+    """True for clusters of which no camera has made a person or a rider, shape (k,), bool."""
     lidar: np.ndarray
     """Row of the detection in this frame, −1 for none, shape (k,), int64."""
     camera: np.ndarray
@@ -240,8 +243,9 @@ class Fusion:
             scores[seen] = _either(scores[seen], config.camera_weight * sure)
             by_camera |= seen
             camera_miss += np.where(support.expected & usable & ~seen, config.camera_miss, 0.0)
-        # The class that both speak for; a cluster of which a camera knows what it is becomes an object of that class.
-        named = by_camera & (likely.argmax(1) != _BACKGROUND_CLASS)
+        # Cameras vote on the class of an object over time, in `_gate`: a class that changed with one image would tear
+        # its track. A cluster becomes an object at once where a camera knows what it is and it is one as a whole.
+        named = by_camera & background & _fits(likely.argmax(1), safe)
         classes[named] = likely[named].argmax(1)
         background[named] = False
 
@@ -425,6 +429,13 @@ def _class_evidence(classes: np.ndarray, scores: np.ndarray) -> np.ndarray:
     table = np.tile(np.log(others)[:, None], (1, len(CLASSES)))
     table[np.arange(len(classes)), classes] = np.log(1.0 - (len(CLASSES) - 1) * others)
     return table
+
+
+def _fits(classes: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Whether boxes of clusters are as long as a whole object of these classes, shape (n,), bool."""
+    least, most = (np.array([_WHOLE.get(k, (np.inf, 0.0))[end] for k in range(len(CLASSES))]) for end in (0, 1))
+    length = boxes[:, 3:5].max(1, initial=0.0)
+    return (length > least[classes]) & (length < most[classes])
 
 
 def _covered(boxes: np.ndarray, background: np.ndarray) -> np.ndarray:

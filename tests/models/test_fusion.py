@@ -159,6 +159,29 @@ def test_a_cluster_gets_the_class_that_a_camera_knows():
     assert objects.background.tolist() == [False]
 
 
+def test_one_image_that_is_wrong_about_the_class_tears_no_track():
+    fusion = Fusion()
+    ids, classes = [], []
+    for frame in range(10):
+        wrong = [camera(frame, car(20), kind=PEDESTRIAN, score=0.95)] if frame == 6 else []
+        objects = step(fusion, frame, [car(20)], score=0.6, cameras=wrong)
+        ids += objects.ids.tolist()
+        classes += objects.classes.tolist()
+    assert ids == [ids[0]] * 10
+    assert classes[-1] == VEHICLE
+
+
+def test_the_side_of_a_car_stays_a_cluster():
+    side = np.array([20.0, 1, -0.8, 4.4, 0.3, 1.6, 0])
+    fusion = Fusion()
+    for frame in range(5):
+        objects = step(
+            fusion, frame, [side], score=0.7, kind=UNKNOWN, background=np.ones(1, bool), cameras=[camera(frame, side)]
+        )
+    assert objects.camera.tolist() == [True]
+    assert objects.background.tolist() == [True]
+
+
 def test_what_a_camera_looks_at_and_does_not_see_becomes_doubtful():
     def after(cameras):
         fusion = Fusion()
