@@ -143,7 +143,7 @@ def show_head(
 def quantize(
     card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the ONNX file and the card.")] = Path("heads"),
-    frames: Annotated[int, typer.Option(min=1, help="Simulated scenes to calibrate with.")] = 24,
+    frames: Annotated[int, typer.Option(min=1, help="Simulated scenes to calibrate with.")] = 12,
 ) -> None:
     """Write a variant of a head in eight bits, calibrated on simulated scenes; measure it with `warploom eval`."""
     from ..components.evaluation.detection_frames import evaluation_frames

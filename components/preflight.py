@@ -135,11 +135,11 @@ def check_models(plan: LaunchPlan) -> Iterator[Finding]:
     file = _profile_of(plan)
     if file is None:
         return
-    from ..models.card import DEFAULT_CARD
+    from ..models.card import default_card
     from ..models.heads import read_card
 
     named = file.content.models.detector
-    card = DEFAULT_CARD if named is None else file.path.parent / named
+    card = default_card(file.content.device) if named is None else file.path.parent / named
     try:
         loaded, model = read_card(card)
     except ModelError as error:

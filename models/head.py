@@ -20,7 +20,7 @@ from ..kernels.device import resolve_device
 from ..kernels.interop import borrow_points
 from ..kernels.nms import RotatedNms
 from ..kernels.pillar import PillarGrid, pillar_channels
-from .card import DEFAULT_CARD, HeadCard, load_card
+from .card import HeadCard, default_card, load_card
 from .classes import CLASSES
 from .detections import Detections
 from .network import PRECISIONS, PROVIDERS, Network
@@ -62,7 +62,7 @@ class DetectionHead:
     """The network of one card, loaded and bound to its buffers.
 
     Args:
-        card: A head's card (YAML), its ONNX file beside it; None is the head that ships with warploom.
+        card: A head's card (YAML), its ONNX file beside it; None is the head that ships, see `default_card`.
         device: A Warp device, such as `cpu` or `cuda:0`; the kernels run there, and the network too where ONNX
             Runtime has a provider for it, else on the CPU, which is logged and said by `provider` and `fallback`.
         threads: CPU threads of the network.
@@ -99,8 +99,8 @@ class DetectionHead:
             raise ValueError(f"score_threshold must be in [0, 1], not {score_threshold}")
         if not 1 <= batch <= 127:
             raise ValueError(f"batch must be 1 to 127, not {batch}")
-        self.card, model = load_card(card or DEFAULT_CARD)
         self.device = resolve_device(device)
+        self.card, model = load_card(card or default_card(self.device))
         self.score_threshold = self.card.decode.score_threshold if score_threshold is None else score_threshold
         self.batch = batch
         asked = self.card.input.channels

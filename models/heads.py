@@ -15,7 +15,7 @@ import warp as wp
 import yaml
 
 from ..errors import ModelError
-from .card import DEFAULT_CARD, ModelCard
+from .card import ModelCard, default_card
 from .detections import Detections
 
 __all__ = ["KINDS", "LidarHead", "card_kind", "open_head", "read_card"]
@@ -97,6 +97,6 @@ def open_head(card: str | Path | None = None, **options: Any) -> Any:
     Raises:
         ModelError: The card or its model is missing, not valid, or the two do not fit.
     """
-    path = card or DEFAULT_CARD
+    path = card or default_card(str(options.get("device", "cpu")))
     module, name, _, _ = KINDS[card_kind(path)]
     return _named(module, name)(path, **options)

@@ -11,7 +11,7 @@ from pydantic import Field
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
 from ...kernels.gather import gather_rows
-from ...models.card import DEFAULT_CARD
+from ...models.card import default_card
 from ...models.detections import Detections
 from ...models.heads import open_head, read_card
 from ..execution import ExecutionContext
@@ -47,7 +47,7 @@ class DetectionProcessor(Processor):
         Raises:
             ModelError: It is not, or does not.
         """
-        read_card(self.context.detector or DEFAULT_CARD)
+        read_card(self.context.detector or default_card(self.context.device))
 
     def init(self, config: DetectionConfig) -> None:
         """Loads the head and runs it once, so that the first frame takes no longer than the others."""
