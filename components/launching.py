@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..dag.configuration import ConfigFile, parse_overrides
 from ..dag.launch.channel import Channel
-from ..dag.launch.child import Child, ProcessLinks, die_with, show_name
+from ..dag.launch.child import Child, ProcessLinks, die_with, end_at_once, show_name
 from ..dag.launch.schema import LaunchSpec, ProcessSpec
 from ..dag.logs import start_logging
 from ..dag.modules import load_module
@@ -269,7 +269,7 @@ def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks, Sequen
 
 
 def main() -> int:
-    """Runs one child."""
+    """Runs one child; gives its exit code once all that it holds is flushed and closed."""
     parser = argparse.ArgumentParser(description="A process of a node; its supervisor starts it.")
     for name in ("--node", "--process", "--plan"):
         parser.add_argument(name, required=True)
@@ -285,4 +285,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    end_at_once(main())

@@ -17,7 +17,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from ...errors import WarploomError
 from .channel import Channel
@@ -26,7 +26,7 @@ from .schema import ProcessSpec
 if TYPE_CHECKING:
     from ..process import Process
 
-__all__ = ["CONFIGURATION", "Child", "ProcessLinks", "die_with", "show_name"]
+__all__ = ["CONFIGURATION", "Child", "ProcessLinks", "die_with", "end_at_once", "show_name"]
 
 CONFIGURATION = 2
 """The exit code of a process whose configuration is bad: to start it again would not help."""
@@ -77,6 +77,20 @@ def show_name(name: str) -> None:
     """Sets the name that the system shows for this process: its first 15 bytes."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_NAME, name.encode()[:15] + b"\0", 0, 0, 0)
+
+
+def end_at_once(code: int) -> NoReturn:
+    """Ends this process with what it has told written, and waits for none of its threads.
+
+    A thread that hangs in native code would keep the interpreter from its end: one that is not a daemon, one that
+    never gives the interpreter back, or one that a library waits for as it is unloaded. The components have been
+    stopped by now: what they record is closed.
+    """
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or nobody reads it
+            stream.flush()
+    os._exit(code)
 
 
 class Child:

@@ -225,6 +225,23 @@ def test_a_process_without_a_sign_of_life_is_killed(start, module, launch_file, 
     node.wait_for("state", 2, state="running")
 
 
+@pytest.mark.parametrize("native", ["daemon in native code", "thread in native code", "library that waits as it ends"])
+def test_what_is_in_native_code_does_not_keep_a_process_from_its_end(start, module, launch_file, tmp_path, native):
+    ticker = module(TICKER, "ticker", topic="ticks", journal=tmp_path / "sent", period=5)
+    recorder = module(RECORDER, "recorder", sent="ticks", path=tmp_path / "run.mcap")
+    stuck = module(PLAIN, "stuck", config=f"{{dies: {native}, path: '{tmp_path / 'noted'}'}}")
+    node = start("launch", launch_file(one=[ticker, recorder, stuck])).up()
+    node.wait_until(lambda: len(versions(tmp_path / "sent")) > 20)
+    assert node.stop() == 0
+    assert node.find("exited", process="one", code=0)
+    assert not node.find("died")
+    assert [line.split()[0] for line in (tmp_path / "noted").read_text().splitlines()] == ["start", "stop"]
+    (path,) = tmp_path.glob("run-*.mcap")
+    recording = Recording(path)
+    assert commits(recording) == set(versions(tmp_path / "sent"))
+    assert recording.closed
+
+
 def test_a_stop_while_it_builds_ends_it_at_once(start, module, launch_file):
     stubborn = module(PLAIN, "stubborn", config="{dies: stubborn build}")
     node = start("launch", launch_file(one=[stubborn]))

@@ -1,5 +1,6 @@
 """Components for the tests of the launcher; none needs Warp."""
 
+import atexit
 import os
 import threading
 import time
@@ -125,11 +126,26 @@ class Plain:
             threading.Timer(0.3, lambda: os._exit(7)).start()
         if self._dies == "holding the interpreter":
             threading.Timer(0.3, hold_the_interpreter).start()
+        if self._dies == "daemon in native code":
+            threading.Thread(target=in_native_code, daemon=True).start()
+        if self._dies == "thread in native code":
+            threading.Thread(target=in_native_code).start()
+        if self._dies == "library that waits as it ends":
+            atexit.register(in_native_code)
 
     def stop(self):
         if self._ignores_stop:
             time.sleep(60)
         self._note("stop")
+
+
+def in_native_code():
+    """Is for a minute where no signal and no flag reaches it; the interpreter is given back."""
+    import ctypes
+
+    begin = time.monotonic()
+    while time.monotonic() < begin + 60:
+        ctypes.CDLL(None).sleep(60)
 
 
 def hold_the_interpreter():
