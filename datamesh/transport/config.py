@@ -15,7 +15,7 @@ class SharedMemoryConfig(BaseModel):
     memory_bytes: int = Field(1 << 32, ge=4096)
     """Address space of a topic, a power of two; memory is taken as it is used [B]."""
     queue: int = Field(8, ge=1, le=128)
-    """How many payloads a reader may have in its queue, beside those that its window keeps."""
+    """How many payloads a reader may have in its queue, beside those that its window keeps of two epochs."""
     history: int = Field(8, ge=0, le=1024)
     """How many of the newest data a reader is sent that connects later."""
     kept: int = Field(64, ge=0, le=1 << 16)

@@ -13,8 +13,8 @@ import os
 import select
 import socket
 import threading
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -25,8 +25,11 @@ from ..messages import encode
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
-from .keeping import Absent, Kept
+from .keeping import Absent
 from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
+from .placing import NoRoom, Placing
+from .readers import Reader
+from .service import ExportService
 from .slabs import Lease, Slab, SlabArena, SlabPool, Usage
 from .wire import (
     COMMIT,
@@ -42,161 +45,13 @@ from .wire import (
     read_greeting,
 )
 
-__all__ = ["ExportService", "Exporter"]
+__all__ = ["Exporter"]
 
 _log = logging.getLogger(__name__)
 
-_SMALL = 1024
-"""Arrays up to so many bytes go with the message, unless they are in a slab already."""
 _COUNTING_S = 0.1
 _NAMES = 256
 """Of how many readers it is known what they were sent, for when they come back."""
-
-
-class ExportService:
-    """The thread that lets readers of all exported topics in, and notices when they go. It sleeps otherwise."""
-
-    def __init__(self, name: str) -> None:
-        """Starts the thread.
-
-        Args:
-            name: Of the thread.
-        """
-        self._epoll = select.epoll()
-        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._handlers: dict[int, Callable[[], None]] = {}
-        self._epoll.register(self._wake, select.EPOLLIN)
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
-
-    def watch(self, one: socket.socket, events: int, handler: Callable[[], None]) -> None:
-        """Calls the handler when one of the events is there. Closing the socket ends it."""
-        fd = one.fileno()
-        known = fd in self._handlers
-        self._handlers[fd] = handler
-        try:
-            self._epoll.modify(fd, events) if known else self._epoll.register(fd, events)
-        except FileNotFoundError:  # the number was that of a socket closed since
-            self._epoll.register(fd, events)
-
-    def _run(self) -> None:
-        while not self._stopping:
-            for fd, _ in self._epoll.poll():
-                handler = self._handlers.get(fd)
-                if handler is None:
-                    continue
-                try:
-                    handler()
-                except Exception:  # the other readers are to be served all the same
-                    _log.exception("a reader could not be served")
-
-    def stop(self) -> None:
-        """Ends the thread."""
-        self._stopping = True
-        os.eventfd_write(self._wake, 1)
-        self._thread.join()
-        self._epoll.close()
-        os.close(self._wake)
-
-
-class _Reader:
-    """A connection to a process that reads the topic."""
-
-    __slots__ = (
-        "blocks",
-        "flight",
-        "held",
-        "kept",
-        "leaves",
-        "most",
-        "name",
-        "number",
-        "reached",
-        "send",
-        "slabs",
-        "socket",
-    )
-
-    def __init__(self, connection: socket.socket, name: str, most: int, blocks: bool) -> None:
-        self.socket = connection
-        self.send = connection.send
-        self.name = name
-        self.most = most
-        """How many payloads it may hold."""
-        self.blocks = blocks
-        self.reached = (-1, -1)
-        """The newest that it was sent: epoch and version."""
-        self.number = 0
-        """Of events, dropped ones too."""
-        self.held = 0
-        self.slabs: Counter[int] = Counter()
-        """Those that it holds, by offset, and how often."""
-        self.flight: deque[Entry] = deque()
-        """What it was sent last, and may not have read."""
-        self.kept: Kept | None = None
-        """What was kept for it while it was away, and what was committed since; None once it has caught up."""
-        self.leaves = False
-        """It has said so; otherwise it was killed."""
-
-    def has_sent(self, entry: Entry, epoch: int, in_slabs: bool) -> None:
-        """Notes what it was sent, for when it is killed; what it has let go of, it has read."""
-        self.reached = max(self.reached, (epoch, entry.version))
-        self.flight.append(entry)
-        while len(self.flight) > (self.held if in_slabs else self.most):
-            self.flight.popleft()
-
-
-class _NoRoom(Exception):  # noqa: N818  (it is no error: the datum is dropped and counted)
-    """The memory of the topic is full."""
-
-
-class _Placing:
-    """Says for each array of a payload in which slab it lies, and copies to one what lies in none."""
-
-    __slots__ = ("_expected", "_lease", "_pool", "copied_bytes", "copies", "leases", "slabs")
-
-    def __init__(self, pool: SlabPool, lease: Callable[[int], Lease | None], expected: int) -> None:
-        self._pool = pool
-        self._lease = lease
-        self._expected = expected
-        self.slabs: list[Slab] = []
-        """In the order of their numbers."""
-        self.leases: list[Lease] = []
-        """Of those that were taken for copies."""
-        self.copies: SlabArena | None = None
-        self.copied_bytes = 0
-
-    def take(self, size: int) -> Lease:
-        """A slab. Raises `_NoRoom`."""
-        found = self._lease(size)
-        if found is None:
-            raise _NoRoom
-        self.leases.append(found)
-        return found
-
-    def __call__(self, array: np.ndarray) -> tuple[int, int] | None:
-        """Number of the slab and offset in it; None for an array that goes with the message."""
-        found = self._pool.locate(array)
-        if found is None:
-            if array.nbytes <= _SMALL:
-                return None
-            found = self._pool.locate(self._copy(array))
-            assert found is not None
-        slab, offset = found
-        slabs = self.slabs
-        if slab in slabs:
-            return slabs.index(slab), offset
-        slabs.append(slab)
-        return len(slabs) - 1, offset
-
-    def _copy(self, array: np.ndarray) -> np.ndarray:
-        if self.copies is None:
-            self.copies = SlabArena(self.take, self._expected, lambda: None)
-        copy = self.copies.array(array.shape, array.dtype)
-        np.copyto(copy, array)
-        self.copied_bytes += array.nbytes
-        return copy
 
 
 class Exporter:
@@ -230,21 +85,21 @@ class Exporter:
         self._name = name
         self._counts: Counter[str] = Counter()
         self._lock = threading.RLock()
-        self._readers: list[_Reader] = []
+        self._readers: list[Reader] = []
         self._reached: dict[str, tuple[int, int]] = {}
         self._stopped = False
         self._built = self._copied = Usage()
         self._newest = self._newest_of(window)
         self._absent = Absent(self._config, self._on_lost)
-        self._behind: list[_Reader] = []
+        self._behind: list[Reader] = []
         self._listener = listen(node, window.topic)
         try:
             self.order = OrderFile(node, window.topic)
             """Under which epochs others see those of the window."""
             self._pool = SlabPool(self._config.memory_bytes)
         except BaseException:
-            self._listener.close()
             unlisten(node, window.topic)
+            self._listener.close()
             raise
         window.arena = self._arena
         self._unsubscribe = window.subscribe(self._on_commit, self._on_settle)
@@ -332,7 +187,7 @@ class Exporter:
                 for reader in tuple(self._readers):
                     self._send(reader, Event(SETTLE, 0, seen, version, 0, 0))
 
-    def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]) -> None:
+    def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[Reader]) -> None:
         """Sends a datum to readers."""
         encoded = self._encoded(entry, epoch, newest, readers)
         if encoded is None:
@@ -344,12 +199,12 @@ class Exporter:
         del leases  # until here they hold the slabs that were copied to
 
     def _encoded(
-        self, entry: Entry, epoch: int, newest: bool, readers: list[_Reader]
+        self, entry: Entry, epoch: int, newest: bool, readers: list[Reader]
     ) -> tuple[Event, list[Slab], list[Lease]] | None:
         """What `_encode` gives; None where it fails, which is counted for the readers."""
         try:
             return self._encode(entry, epoch, newest)
-        except _NoRoom:
+        except NoRoom:
             self._lose("no_memory", entry.version, readers)
         except (TypeError, ValueError) as error:
             if not self._counts["not_encodable"]:
@@ -357,7 +212,7 @@ class Exporter:
             self._lose("not_encodable", entry.version, readers)
         return None
 
-    def _lose(self, reason: str, version: int, readers: list[_Reader]) -> None:
+    def _lose(self, reason: str, version: int, readers: list[Reader]) -> None:
         for reader in readers:
             reader.number += 1
         self._counts[reason] += len(readers)
@@ -367,13 +222,13 @@ class Exporter:
         """A datum as an event, the slabs that it is in, and what holds those that were taken for it.
 
         Raises:
-            _NoRoom: There is no room to copy it to.
+            NoRoom: There is no room to copy it to.
             TypeError: It has no form as a message.
         """
         version, value, received, committed, _, triggers, completion, _ = entry
         if completion is not None:  # on the host: what a device still writes is waited for
             value = entry.read()
-        placing = _Placing(self._pool, self._lease, self._copied.size)
+        placing = Placing(self._pool, self._lease, self._copied.size)
         body, size = encode(value, placing), 0
         slabs = placing.slabs
         if placing.copies is not None:
@@ -423,7 +278,7 @@ class Exporter:
             connection.close()
             return
         most = max(1, min(hello["capacity"], 1 << 16)) + self._config.queue
-        reader = _Reader(connection, hello["reader"], most, hello["blocks"])
+        reader = Reader(connection, hello["reader"], most, hello["blocks"])
         with self._lock:
             if self._stopped:
                 connection.close()
@@ -448,7 +303,7 @@ class Exporter:
                 self._reached.pop(reader.name, None)
                 self._catch_up(reader)
 
-    def _send_history(self, reader: _Reader) -> None:
+    def _send_history(self, reader: Reader) -> None:
         """Sends what a new reader has missed; it triggers, unless it was sent to the reader's life before."""
         snapshot = self._window.snapshot()
         reached = self._reached.pop(reader.name, (-1, -1))
@@ -459,7 +314,7 @@ class Exporter:
             self._tell(entry._replace(triggers=triggers), epoch, False, [reader])
         reader.reached = max(reader.reached, reached)
 
-    def _serve(self, reader: _Reader) -> None:
+    def _serve(self, reader: Reader) -> None:
         with self._lock:
             self._collect(reader)
             if reader.kept is not None:
@@ -476,7 +331,7 @@ class Exporter:
         self._counts["away"] += 1
         self._window.losses.count(self._window.topic, "link_away", entry.version)
 
-    def _keep_for(self, reader: _Reader) -> None:
+    def _keep_for(self, reader: Reader) -> None:
         """From here on data are kept for a reader that was killed, beginning with what it may not have read."""
         entries = {(entry.epoch, entry.version): (entry, True) for entry in reader.flight}
         for entry, sent in reader.kept.entries if reader.kept is not None else ():
@@ -498,21 +353,21 @@ class Exporter:
                 self._on_lost(lost)
             self._catch_up(reader)
 
-    def _catch_up(self, reader: _Reader) -> None:
+    def _catch_up(self, reader: Reader) -> None:
         """Sends what was kept for a reader, as far as there is room; one that blocks its producer is waited for."""
         while (kept := reader.kept) is not None and kept.entries:
-            if reader.held >= reader.most:
+            if reader.is_full:
                 self._collect(reader)
             if reader.socket.fileno() < 0:
                 return
-            if reader.held < reader.most and self._send_kept(reader, *kept.entries[0]):
+            if not reader.is_full and self._send_kept(reader, *kept.entries[0]):
                 kept.entries.popleft()
             elif reader.socket.fileno() < 0:
                 return
             elif reader.blocks and not self._stopped:
-                self._wait_for(reader, full=reader.held >= reader.most)
+                reader.wait(full=reader.is_full)
             else:
-                wanted = select.EPOLLOUT if reader.held < reader.most else 0
+                wanted = select.EPOLLOUT if not reader.is_full else 0
                 self._service.watch(
                     reader.socket, select.EPOLLIN | select.EPOLLRDHUP | wanted, lambda: self._serve(reader)
                 )
@@ -522,7 +377,7 @@ class Exporter:
             reader.kept = None
             self._service.watch(reader.socket, select.EPOLLRDHUP, lambda: self._serve(reader))
 
-    def _send_kept(self, reader: _Reader, entry: Entry, sent: bool) -> bool:
+    def _send_kept(self, reader: Reader, entry: Entry, sent: bool) -> bool:
         """Sends a datum again, or late; tells whether it is done with."""
         epoch = self.order.epoch(entry.epoch, entry.version)
         entry = entry._replace(triggers=entry.triggers and not sent)
@@ -538,7 +393,7 @@ class Exporter:
 
     # Messages
 
-    def _send(self, reader: _Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
+    def _send(self, reader: Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
         """Sends an event, if the reader has room; one that blocks its producer is waited for. Tells whether it did."""
         reader.number += 1
         data = pack_event(event, reader.number)
@@ -549,20 +404,13 @@ class Exporter:
                 self._counts["slow"] += 1
                 self._window.losses.count(self._window.topic, "link_slow", event.version)
                 return False
-            self._wait_for(reader, full=bool(slabs) and reader.held >= reader.most)
+            reader.wait(full=bool(slabs) and reader.is_full)
         return True
 
-    @staticmethod
-    def _wait_for(reader: _Reader, full: bool) -> None:
-        """Waits until a reader has let go of something, or takes another message where it is not full."""
-        poll = select.poll()
-        poll.register(reader.socket, select.POLLIN | (0 if full else select.POLLOUT))
-        poll.poll(50)
-
-    def _try_send(self, reader: _Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
-        if slabs and reader.held >= reader.most:
+    def _try_send(self, reader: Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
+        if slabs and reader.is_full:
             self._collect(reader)
-            if reader.held >= reader.most:
+            if reader.is_full:
                 return False
         try:
             reader.send(data)
@@ -574,17 +422,14 @@ class Exporter:
             return False
         self._counts["sent"] += 1
         self._counts["sent_bytes"] += len(data)
-        for slab in slabs:
-            slab.holders += 1
-            reader.slabs[slab.offset] += 1
-            reader.held += 1
+        reader.holds(slabs)
         return True
 
     def _collect_all(self) -> None:
         for reader in tuple(self._readers):
             self._collect(reader)
 
-    def _collect(self, reader: _Reader) -> None:
+    def _collect(self, reader: Reader) -> None:
         """Takes back the slabs that a reader has let go of; all of them where it is gone."""
         while True:
             try:
@@ -597,23 +442,12 @@ class Exporter:
                 self._drop(reader)
                 return
             for (offset,) in RELEASE.iter_unpack(data[: len(data) // RELEASE.size * RELEASE.size]):
-                if reader.slabs[offset] > 0:  # what it does not hold, it cannot let go of
-                    self._let_go(reader, offset, 1)
+                if reader.lets_go(offset):  # what it does not hold, it cannot let go of
+                    self._pool.release(self._pool.at(offset))
                 elif offset == LEAVES:
                     reader.leaves = True
 
-    def _let_go(self, reader: _Reader, offset: int, times: int) -> None:
-        slab = self._pool.at(offset)
-        reader.slabs[offset] -= times
-        if not reader.slabs[offset]:
-            del reader.slabs[offset]
-        reader.held -= times
-        while len(reader.flight) > reader.held:
-            reader.flight.popleft()
-        for _ in range(times):
-            self._pool.release(slab)
-
-    def _drop(self, reader: _Reader) -> None:
+    def _drop(self, reader: Reader) -> None:
         """Forgets a reader that is gone, and takes back what it held."""
         if reader not in self._readers:
             return
@@ -628,6 +462,7 @@ class Exporter:
         self._reached[reader.name] = max(reader.reached, self._reached.pop(reader.name, reader.reached))
         if len(self._reached) > _NAMES:
             del self._reached[next(iter(self._reached))]
-        for offset, times in list(reader.slabs.items()):
-            self._let_go(reader, offset, times)
+        for offset in reader.slabs():
+            reader.lets_go(offset)
+            self._pool.release(self._pool.at(offset))
         self._counts["disconnections"] += 1

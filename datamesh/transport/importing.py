@@ -173,7 +173,7 @@ class Importer:
             hello = {
                 "topic": self._window.topic,
                 "reader": self._name,
-                "capacity": self._window.capacity,
+                "capacity": 2 * self._window.capacity,  # of the epoch before too, until the new one has filled it
                 "blocks": self._blocks,
             }
             one.send(pack_greeting(hello))

@@ -8,11 +8,13 @@ Memory has no name (`slabs`), so these are all that a killed process leaves behi
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 import socket
 import stat
 import struct
+import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -50,6 +52,8 @@ os.register_at_fork(after_in_child=_close_inherited)
 
 _ANSWER_S = 2.0
 """How long a process that listens may take to answer."""
+_LOCK_S = 10.0
+"""How long another process may bind or remove sockets, which takes milliseconds."""
 _CREDENTIALS = struct.Struct("3i")
 _ORDER = struct.Struct("<QQ")
 _MAGIC = b"warploom"
@@ -95,6 +99,32 @@ def _path(node: str, topic: str, kind: str) -> Path:
 
 
 @contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keeps others from binding and removing sockets. The kernel ends it with the process.
+
+    Raises:
+        TimeoutError: Another process has done so for long.
+    """
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    end = time.monotonic() + _LOCK_S
+    try:
+        while True:
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() >= end:
+                    raise TimeoutError(f"{folder}: is locked by another process, which hangs") from None
+                time.sleep(0.002)
+        try:
+            yield
+        finally:
+            fcntl.flock(fd, fcntl.LOCK_UN)  # closing it would leave it to children that were forked meanwhile
+    finally:
+        os.close(fd)
+
+
+@contextmanager
 def _address(path: Path) -> Iterator[str]:
     """The address of a socket; a long path by way of its folder, as addresses have at most 107 bytes."""
     if len(os.fsencode(path)) <= 100:
@@ -137,29 +167,33 @@ def listen(node: str, topic: str) -> socket.socket:
     """The socket at which readers of a topic connect. It takes the place of one whose process is dead.
 
     Raises:
-        ConfigError: A process that lives exports the topic.
+        ConfigError: A process that lives exports the topic, or hangs while it begins to export one.
     """
     path = _path(node, topic, "socket")
     try:
+        with _locked(path.parent):
+            return _bound(path, f"topic {topic!r} of node {node!r}")
+    except TimeoutError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _bound(path: Path, topic: str) -> socket.socket:
+    try:
         other = _connected(path)
     except OSError as error:
-        raise ConfigError(f"topic {topic!r} of node {node!r} is exported already, by a process that hangs") from error
+        raise ConfigError(f"{topic} is exported already, by a process that hangs") from error
     if other is not None:
         pid = peer_of(other)[0]
         other.close()
-        raise ConfigError(f"topic {topic!r} of node {node!r} is exported already, by process {pid}")
+        raise ConfigError(f"{topic} is exported already, by process {pid}")
     one = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     keep_from_children(one)
-    # Bound under another name, so that nobody finds it before it listens, and takes it for one of the dead.
-    beside = path.with_suffix(f".{os.getpid()}")
     try:
-        with suppress(FileNotFoundError):
-            beside.unlink()
-        with _address(beside) as address:
+        path.unlink(missing_ok=True)
+        with _address(path) as address:
             one.bind(address)
         one.listen(64)
         one.setblocking(False)
-        beside.rename(path)
     except BaseException:
         one.close()
         raise
@@ -199,21 +233,18 @@ def reap(node: str) -> list[str]:
 
     Sockets whose process is gone; and once no process of the node exports anything any more, the orders of its topics.
     Memory needs no reaping: it has no name, and goes with the last process that maps it.
+
+    Raises:
+        TimeoutError: Another process of the node hangs while it begins to export.
     """
-    removed: list[Path] = []
-    alive = False
     folder = _links(node)
-    for path in sorted(folder.iterdir()):
-        if path.suffix == ".order":
-            continue
-        if _is_alive(path):
-            alive = True
-        elif path.suffix == ".socket" or not Path(f"/proc/{path.suffix[1:]}").exists():
-            removed.append(path)
-    if not alive:
-        removed += sorted(folder.glob("*.order"))
-    for path in removed:
-        path.unlink(missing_ok=True)
+    with _locked(folder):  # what is dead is removed, and not what has taken its place
+        sockets = sorted(folder.glob("*.socket"))
+        removed = [path for path in sockets if not _is_alive(path)]
+        if len(removed) == len(sockets):
+            removed += sorted(folder.glob("*.order"))
+        for path in removed:
+            path.unlink(missing_ok=True)
     return [os.fspath(path) for path in removed]
 
 

@@ -258,9 +258,9 @@ def test_memory_is_used_again_and_never_while_a_reader_pins_it(linked):
     assert writer.counts("topic")["slabs"] <= 2 * 4 + 2
 
 
-def until_shown(side, version):
+def until_shown(side, version, epoch=0):
     end = time.monotonic() + 30
-    while side.mesh.window("topic").snapshot().versions[-1:] != (version,):
+    while (shown := side.mesh.window("topic").snapshot()).versions[-1:] != (version,) or shown.epoch != epoch:
         assert time.monotonic() < end
         time.sleep(0.0005)
 
@@ -283,15 +283,51 @@ class TestReaders:
             for version in range(2, 42):
                 assert writer.commit("topic", version, built(version)) is Status.OK
             counts = writer.counts("topic")
-            assert counts["sent"] == 2 + 3, "what its window keeps, and its queue"
+            assert counts["sent"] == 2 * 2 + 3, "what its window keeps of two epochs, and its queue"
             assert counts["slow"] == 41 - counts["sent"]
             assert writer.mesh.losses["topic", "link_slow"] == counts["slow"]
         finally:
             go_on.set()
-        reader.until(lambda counts: counts.get("received") == 5, "topic")
+        reader.until(lambda counts: counts.get("received") == 2 * 2 + 3, "topic")
         writer.commit("topic", 100, built(100))
         until_shown(reader, 100)
         assert reader.counts("topic")["missed"] == counts["slow"]
+
+    def test_a_new_epoch_does_not_end_what_a_reader_gets(self, linked):
+        """Its window keeps the data of the epoch before until the new one has filled it."""
+        writer, reader = linked(capacity=4, queue=1)
+        for epoch in range(3):
+            for version in range(1, 21):
+                writer.commit("topic", version, built(version))
+                until_shown(reader, version, epoch)
+            if epoch < 2:
+                writer.mesh.window("topic").new_epoch()
+        writer.commit("topic", 1, built(1), CommitPolicy.FORCE_NEW_EPOCH)
+        until_shown(reader, 1, 3)
+        orders = [(epoch, version) for epoch in range(3) for version in range(1, 21)]
+        assert [one[:2] for one in reader.commits["topic"]] == [*orders, (3, 1)]
+        counts = writer.counts("topic")
+        assert counts.get("slow", 0) == counts.get("no_memory", 0) == 0
+        assert counts["slabs"] <= 2 * 4 + 1
+
+    def test_what_a_reader_may_hold_are_data_in_however_many_slabs(self, linked):
+        """Each is a list of the newest arrays, which lie in slabs of their own."""
+        writer, reader = linked(capacity=4, queue=1)
+        arrays = []
+        for version in range(1, 31):
+
+            def build(change, version=version):
+                arrays.append(change.array(1000, np.int64))
+                arrays[-1][:] = version
+                del arrays[:-5]
+                return list(arrays)
+
+            writer.commit("topic", version, build)
+            until_shown(reader, version)
+        assert [array[0] for array in last(reader)] == list(range(26, 31))
+        arrays.clear()
+        assert writer.counts("topic").get("slow", 0) == writer.counts("topic")["copied"] == 0
+        assert writer.counts("topic")["slabs"] == 4 + 5 - 1
 
     def test_messages_without_slabs_are_bounded_too(self, linked):
         writer, reader = linked()

@@ -4,11 +4,13 @@ import os
 import signal
 import socket
 import stat
+import threading
 import time
+from contextlib import suppress
 
 import pytest
 
-from warploom.datamesh.transport import exported_topics, reap, run_folder
+from warploom.datamesh.transport import exported_topics, places, reap, run_folder
 from warploom.datamesh.transport.places import OrderFile, connect, listen, peer_of, unlisten
 from warploom.errors import ConfigError
 
@@ -129,14 +131,59 @@ def test_reaping_takes_what_the_dead_left_and_names_it(node, listening):
     assert reap(node) == []
 
 
-def test_reaping_leaves_what_a_process_is_about_to_bind(node):
-    links = run_folder(node) / "links"
-    assert reap(node) == []
-    mine, dead = links / f"a.{os.getpid()}", links / "a.4000000000"
-    for path in (mine, dead):
-        path.touch()
-    assert reap(node) == [str(dead)]
-    assert mine.exists()
+def test_reaping_leaves_a_socket_that_took_the_place_of_a_dead_one(node, monkeypatch, listening):
+    """It is bound as soon as the old one is found dead."""
+    leave_a_socket(node, "a")
+    binding = threading.Thread(target=listening, args=(node, "a"))
+    is_alive = places._is_alive
+
+    def found(path):
+        alive = is_alive(path)
+        binding.start()
+        binding.join(0.3)
+        return alive
+
+    monkeypatch.setattr(places, "_is_alive", found)
+    reap(node)
+    binding.join()
+    assert connect(node, "a") is not None
+
+
+def test_of_two_that_find_a_socket_dead_one_takes_its_place(node, monkeypatch, listening):
+    leave_a_socket(node, "a")
+    connected, both = places._connected, threading.Barrier(2)
+
+    def found(path):
+        other = connected(path)
+        with suppress(threading.BrokenBarrierError):
+            both.wait(0.3)
+        return other
+
+    refused = []
+
+    def listens():
+        try:
+            listening(node, "a")
+        except ConfigError as error:
+            refused.append(str(error))
+
+    monkeypatch.setattr(places, "_connected", found)
+    threads = [threading.Thread(target=listens) for _ in range(2)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert refused == [f"topic 'a' of node 'node' is exported already, by process {os.getpid()}"]
+
+
+def test_a_process_that_stops_in_the_middle_is_not_waited_for_for_ever(node, monkeypatch):
+    monkeypatch.setattr(places, "_LOCK_S", 0.1)
+    with places._locked(places._links(node)):
+        with pytest.raises(ConfigError, match="is locked"):
+            listen(node, "a")
+        with pytest.raises(TimeoutError, match="is locked"):
+            reap(node)
+    listen(node, "a").close()
 
 
 def test_a_process_that_hangs_is_not_dead(node, listening):
