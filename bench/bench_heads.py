@@ -9,6 +9,7 @@ import pytest
 
 from warploom.bench.contest import Contender, peer
 from warploom.bench.scans import REAL
+from warploom.models.card import DEFAULT_CARD, EIGHT_BITS_CARD
 from warploom.models.head import DetectionHead
 from warploom.models.network import Network
 
@@ -46,26 +47,13 @@ def backbone(folder):
     return path, sum(parameter.numel() for parameter in whole.parameters())
 
 
-@pytest.fixture(scope="session")
-def eight_bits(tmp_path_factory):
-    """The shipped head, quantised with scenes of the simulator."""
-    peer("onnx")
-    from warploom.components.evaluation.detection_frames import evaluation_frames
-    from warploom.models.card import DEFAULT_CARD
-    from warploom.models.quantization import quantize_head
-
-    scenes = evaluation_frames("sim:scenes?seeds=600-605&lidar=hdl64")
-    frames = ((scene.points, scene.sensor_height) for scene in scenes)
-    return quantize_head(DEFAULT_CARD, tmp_path_factory.mktemp("eight"), frames)
-
-
 def found(result):
     return f"{len(result)} objects"
 
 
 def agreement(card, points):
-    """How far a variant's boxes are from those of the shipped head, at the card's score."""
-    ours, other = DetectionHead(threads=_THREADS), DetectionHead(card, threads=_THREADS)
+    """How far a variant's boxes are from those in floating point, at the card's score."""
+    ours, other = DetectionHead(DEFAULT_CARD, threads=_THREADS), DetectionHead(card, threads=_THREADS)
     a, b = ours.detect_points(points, _HEIGHT), other.detect_points(points, _HEIGHT)
     if not len(a) or not len(b):
         return f"{len(b)} of {len(a)} objects"
@@ -75,10 +63,10 @@ def agreement(card, points):
 
 @pytest.mark.parametrize("who", [HEAD, EIGHT_BITS])
 @pytest.mark.parametrize("scan", CLOUDS)
-def bench_head(contest, who, scan, request):
+def bench_head(contest, who, scan):
     points = contest.cloud(scan)
-    card = request.getfixturevalue("eight_bits") if who == EIGHT_BITS else None
-    said = agreement(card, points) if card else None
+    card = EIGHT_BITS_CARD if who == EIGHT_BITS else DEFAULT_CARD
+    said = agreement(card, points) if who == EIGHT_BITS else None
 
     def call(device):
         head = DetectionHead(card, device=device, threads=_THREADS)
