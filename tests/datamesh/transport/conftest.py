@@ -16,7 +16,9 @@ from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
 from warploom.datamesh.transport import SharedMemoryConfig
 
 PEER = pathlib.Path(__file__).with_name("peer.py")
-PATIENCE = 120.0  # [s] for what takes milliseconds, and a process that starts a second, on a machine that is not busy
+# Limits say that something hangs, not that it is slow: they are only waited for where a test fails.
+PATIENCE = 30.0  # [s] for what takes milliseconds
+STARTING = 120.0  # [s] for the first word of a new process: a second of imports, of which others may take most
 
 
 def until(condition, what="it"):
@@ -114,6 +116,7 @@ class Peer:
         )
         self.pid = self.process.pid
         self._lines = queue.SimpleQueue()
+        self._patience = STARTING
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -124,7 +127,8 @@ class Peer:
 
     def next(self):
         """What it says next; None at its end."""
-        line = self._lines.get(timeout=PATIENCE)
+        line = self._lines.get(timeout=self._patience)
+        self._patience = PATIENCE
         return None if line is None else json.loads(line)
 
     def wait_for(self, key):

@@ -106,6 +106,8 @@ def kill_relays(peer, times):
     """Three in a row: the one in the middle is killed; the last one sees each version at most once, in order."""
     last = peer("read", "last", "result")
     writer = peer("write", "writer", "cloud", 1, CLOUD, 4, 100_000)
+    for one in (last, writer):
+        one.wait_for("ready")
     got = []
     for life in range(times):
         relay = peer("relay", "relay", "cloud", "result")
@@ -121,7 +123,7 @@ def kill_relays(peer, times):
 
 def kill_recorders(peer, times):
     """What is committed while the one that notes it is dead is kept for it: all is noted, in one of its lives."""
-    peer("write", "writer", "cloud", 1, 8_000, 20, 1_000_000)
+    peer("write", "writer", "cloud", 1, 8_000, 20, 1_000_000).wait_for("ready")
     noted = set()
     for life in range(times + 1):
         recorder = peer("note", "recorder", "cloud")
@@ -151,6 +153,8 @@ def test_whoever_is_killed_a_hundred_times_the_others_go_on(peer, who):
 def test_nothing_is_left_when_all_are_killed_at_once(peer):
     before = set(os.listdir("/dev/shm"))
     peers = [peer("read", "reader", "cloud"), peer("write", "writer", "cloud", 1, CLOUD, 1, 100_000)]
+    for one in peers:
+        one.wait_for("ready")
     read_on(peers[0])
     for one in peers:
         one.kill()
@@ -165,8 +169,8 @@ def test_two_nodes_side_by_side_do_not_meet(peer):
     readers = {node: peer("read", "reader", "cloud", of=node) for node in ("node", "other")}
     for one in readers.values():
         one.wait_for("ready")
-    peer("write", "writer", "cloud", 1000, 8000, 1, 50).wait_for("ready")
-    peer("write", "writer", "cloud", 1, 8000, 1, 50, of="other").wait_for("ready")
-    for node, first in (("node", 1000), ("other", 1)):
+    peer("write", "writer", "cloud", LIFE, 8000, 1, 100_000).wait_for("ready")
+    peer("write", "writer", "cloud", 1, 8000, 1, 100_000, of="other").wait_for("ready")
+    for node, first in (("node", LIFE), ("other", 1)):
         got = orders(read_on(readers[node], 10))
-        assert all(epoch == 0 and first <= version < first + 50 for epoch, version in got)
+        assert all(epoch == 0 and first <= version < first + 100_000 for epoch, version in got)
