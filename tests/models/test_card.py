@@ -6,7 +6,7 @@ import torch
 import yaml
 
 from warploom.errors import ModelError
-from warploom.models.card import DEFAULT_CARD, load_card, save_card
+from warploom.models.card import DEFAULT_CARD, EIGHT_BITS_CARD, default_card, load_card, save_card
 from warploom.models.head import DetectionHead
 from warploom.models.training.export import export_head
 from warploom.models.training.network import PillarCenterNet
@@ -151,3 +151,17 @@ def test_the_shipped_head_fits_its_card_and_is_small():
     assert card.training
     assert card.measured
     assert card.licence
+
+
+def test_a_cpu_gets_the_head_in_eight_bits_and_a_gpu_in_floating_point():
+    assert default_card("cpu") == EIGHT_BITS_CARD
+    assert default_card("cuda:0") == DEFAULT_CARD
+    whole, small = load_card(DEFAULT_CARD)[0], load_card(EIGHT_BITS_CARD)[0]
+    assert small.training["quantised_from"] == whole.sha256
+    assert (small.input, small.output, small.decode, small.classes) == (
+        whole.input,
+        whole.output,
+        whole.decode,
+        whole.classes,
+    )
+    assert DetectionHead(threads=1).card == small
