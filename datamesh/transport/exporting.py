@@ -33,6 +33,7 @@ from .service import ExportService
 from .slabs import Lease, Slab, SlabArena, SlabPool, Usage
 from .wire import (
     COMMIT,
+    ENDS,
     INLINE,
     LEAVES,
     MESSAGE,
@@ -86,6 +87,7 @@ class Exporter:
         self._counts: Counter[str] = Counter()
         self._lock = threading.RLock()
         self._readers: list[Reader] = []
+        self._ended: list[Reader] = []  # of which some still hold what they were sent
         self._reached: dict[str, tuple[int, int]] = {}
         self._stopped = False
         self._built = self._copied = Usage()
@@ -125,7 +127,7 @@ class Exporter:
         with self._lock:
             unlisten(self._node, self._window.topic)
             self._listener.close()
-            for reader in tuple(self._readers):
+            for reader in (*self._readers, *self._ended):
                 self._drop(reader)
             self._pool.close()
             self.order.close()
@@ -358,11 +360,11 @@ class Exporter:
         while (kept := reader.kept) is not None and kept.entries:
             if reader.is_full:
                 self._collect(reader)
-            if reader.socket.fileno() < 0:
+            if reader.ended:
                 return
             if not reader.is_full and self._send_kept(reader, *kept.entries[0]):
                 kept.entries.popleft()
-            elif reader.socket.fileno() < 0:
+            elif reader.ended:
                 return
             elif reader.blocks and not self._stopped:
                 reader.wait(full=reader.is_full)
@@ -398,7 +400,7 @@ class Exporter:
         reader.number += 1
         data = pack_event(event, reader.number)
         while not self._try_send(reader, data, slabs):
-            if reader.socket.fileno() < 0:
+            if reader.ended:
                 return False
             if not reader.blocks or self._stopped:
                 self._counts["slow"] += 1
@@ -418,7 +420,9 @@ class Exporter:
             self._collect(reader)
             return False
         except OSError:
-            self._drop(reader)
+            self._collect(reader)  # it may have said that it still holds what it has
+            if not reader.ended:
+                self._drop(reader)
             return False
         self._counts["sent"] += 1
         self._counts["sent_bytes"] += len(data)
@@ -426,7 +430,7 @@ class Exporter:
         return True
 
     def _collect_all(self) -> None:
-        for reader in tuple(self._readers):
+        for reader in (*self._readers, *self._ended):
             self._collect(reader)
 
     def _collect(self, reader: Reader) -> None:
@@ -446,13 +450,15 @@ class Exporter:
                     self._pool.release(self._pool.at(offset))
                 elif offset == LEAVES:
                     reader.leaves = True
+                elif offset == ENDS and not reader.ended:
+                    self._end(reader)
+                    self._service.watch(reader.socket, select.EPOLLRDHUP, lambda: self._serve(reader))
 
-    def _drop(self, reader: Reader) -> None:
-        """Forgets a reader that is gone, and takes back what it held."""
-        if reader not in self._readers:
-            return
+    def _end(self, reader: Reader) -> None:
+        """Sends a reader no more; what it holds stays as it is until it lets go of it."""
         self._readers.remove(reader)
-        reader.socket.close()
+        self._ended.append(reader)
+        reader.ended = True
         if not reader.leaves and not self._stopped:
             self._keep_for(reader)
         reader.flight.clear()  # who waits for its socket may know it for longer
@@ -462,7 +468,16 @@ class Exporter:
         self._reached[reader.name] = max(reader.reached, self._reached.pop(reader.name, reader.reached))
         if len(self._reached) > _NAMES:
             del self._reached[next(iter(self._reached))]
+        self._counts["disconnections"] += 1
+
+    def _drop(self, reader: Reader) -> None:
+        """Forgets a reader that is gone, and takes back what it held."""
+        if reader in self._readers:
+            self._end(reader)
+        if reader not in self._ended:
+            return
+        self._ended.remove(reader)
+        reader.socket.close()
         for offset in reader.slabs():
             reader.lets_go(offset)
             self._pool.release(self._pool.at(offset))
-        self._counts["disconnections"] += 1

@@ -25,7 +25,7 @@ from ..window import Window
 from .config import SharedMemoryConfig
 from .places import connect, peer_of
 from .slabs import Lease, Region
-from .wire import LEAVES, MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
+from .wire import ENDS, LEAVES, MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
 
 __all__ = ["Importer", "publish"]
 
@@ -53,6 +53,17 @@ class _Connection:
     def lease(self, slab: tuple[int, int]) -> Lease:
         """A slab, which the writer is told of when it is no longer needed."""
         return self.region.lease(*slab, slab[0], self._let_go)
+
+    def __del__(self) -> None:
+        # Whose slabs are let go of one by one after the end of receiving, and with the last of them the socket.
+        self.socket.close()
+
+    def end(self, *words: int) -> None:
+        """Receives no more; the writer leaves alone what is held."""
+        with suppress(OSError):
+            one = b"".join(RELEASE.pack(word) for word in words)
+            self.socket.send(one, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            self.socket.shutdown(socket.SHUT_RD)
 
     def _let_go(self, offset: int) -> None:
         # Called wherever the last array of a slab ends, in whatever thread: it takes no lock and never waits.
@@ -122,8 +133,9 @@ class Importer:
             if self._socket is not None:
                 with suppress(OSError):
                     if self._connection is not None:
-                        self._socket.send(RELEASE.pack(LEAVES), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-                    self._socket.shutdown(socket.SHUT_RDWR)
+                        self._connection.end(LEAVES, ENDS)
+                    else:
+                        self._socket.shutdown(socket.SHUT_RDWR)
         if self._thread is not None:
             self._thread.join(_STOP_S)
             if self._thread.is_alive():
@@ -148,12 +160,14 @@ class Importer:
                 continue
             self._complaint = ""
             self._counts["connections"] += 1
+            gone = True
             try:
-                self._receive(connection)
+                gone = self._receive(connection)
             finally:
                 with self._lock:
                     self._connection = self._socket = None
-                    connection.socket.close()
+                    if gone:
+                        connection.socket.close()
                 del connection
 
     def _connect(self) -> _Connection | None:
@@ -207,22 +221,23 @@ class Importer:
             raise SourceError(f"the process that exports {self._window.topic!r} sent no memory")
         return _Connection(one, Region(fds[0], welcome["memory"], writable=False), welcome["writer"])
 
-    def _receive(self, connection: _Connection) -> None:
-        """Receives until the writer or this reader ends."""
+    def _receive(self, connection: _Connection) -> bool:
+        """Receives until the writer or this reader ends; tells whether it is the writer that is gone."""
         number = 0
         while True:
             try:
                 data = connection.socket.recv(MESSAGE)
             except OSError:
-                return
+                data = b""
             if not data:
-                return
+                return not self._stopping.is_set()
             try:
                 event = read_event(data, connection.region.size)
             except ValueError as error:
                 # The numbers of what comes next cannot be trusted either: both ends begin anew.
                 self._damaged(0, error)
-                return
+                connection.end(ENDS)
+                return False
             missing, number = event.number - number - 1, event.number
             if missing > 0:
                 self._counts["missed"] += missing

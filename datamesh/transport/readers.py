@@ -19,6 +19,7 @@ class Reader:
     __slots__ = (
         "_slabs",
         "blocks",
+        "ended",
         "flight",
         "held",
         "kept",
@@ -59,7 +60,9 @@ class Reader:
         self.kept: Kept | None = None
         """What was kept for it while it was away, and what was committed since; None once it has caught up."""
         self.leaves = False
-        """It has said so; otherwise it was killed."""
+        """It has said good-bye; otherwise it was killed."""
+        self.ended = False
+        """It is sent nothing any more."""
 
     @property
     def is_full(self) -> bool:

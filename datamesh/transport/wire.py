@@ -1,7 +1,8 @@
 """What writer and reader say to each other, as messages of a Unix socket that keeps their boundaries.
 
-    reader → writer   once: a hello (codec), then 8 bytes for each slab that it lets go of: its offset; at the end,
-                      unless it is killed, `LEAVES` in their place
+    reader → writer   once: a hello (codec), then 8 bytes for each slab that it lets go of: its offset; in place of one
+                      `LEAVES`, a good-bye: nothing is kept for it; and `ENDS`: it reads no more, but holds what it has
+                      until it lets go of it, or closes the socket
     writer → reader   once: a welcome (codec) with the descriptor of the memory, then events
 
 An event is its head, for each slab offset and size, and its body: the payload as the codec makes it, arrays in slabs by
@@ -19,6 +20,7 @@ from ..messages import decode, encode
 
 __all__ = [
     "COMMIT",
+    "ENDS",
     "INLINE",
     "LEAVES",
     "MESSAGE",
@@ -37,6 +39,7 @@ MESSAGE = 1 << 15
 """The longest message that is received [B]."""
 RELEASE = struct.Struct("<Q")
 LEAVES = (1 << 64) - 1
+ENDS = (1 << 64) - 2
 COMMIT, SETTLE = _KINDS = (1, 2)
 _TRIGGERS, _NEWEST, _IN_SLAB = 1, 2, 4
 _HEAD = struct.Struct("<BBHIQQQqq")

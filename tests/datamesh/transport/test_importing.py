@@ -316,3 +316,34 @@ class TestDamage:
             reader.links.stop()
             assert one.recv(MESSAGE) == b"", "it has gone before it was answered"
         assert reader.links.counters() == {}
+
+
+def test_what_was_received_stays_as_it_is_when_receiving_ends(side):
+    """The writer goes on, and uses its memory again only as it is let go of."""
+    writer = side("writer", exports=["topic"], capacity=1)
+    reader = side("reader", imports=["topic"], capacity=4)
+    writer.until(lambda counts: counts["readers"] == 1, "topic")
+
+    def commit(version):
+        def build(change):
+            array = change.array(2000, np.int64)
+            array[:] = version
+            return array
+
+        writer.commit("topic", version, build)
+
+    for version in range(1, 5):
+        commit(version)
+    reader.until(lambda counts: counts.get("received") == 4, "topic")
+    reader.links.end_import("topic")
+    writer.until(lambda counts: counts["readers"] == 0, "topic")
+    for version in range(5, 40):
+        commit(version)
+    snapshot = reader.mesh.window("topic").snapshot()
+    assert [set(array.tolist()) for array in snapshot] == [{version} for version in range(1, 5)]
+    assert writer.counts("topic")["slabs"] == 4 + 1
+    del snapshot
+    reader.mesh.window("topic").new_epoch()
+    reader.mesh.window("topic").new_epoch()
+    writer.until(lambda counts: counts["slabs"] == 1, "topic")
+    assert writer.counts("topic").get("slow", 0) == writer.counts("topic")["kept"] == 0
