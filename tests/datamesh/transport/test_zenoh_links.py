@@ -202,6 +202,7 @@ def test_two_processes_meet_over_zenoh(peer, endpoint):
     reader = peer("read", "reader", "cloud", of="there", zenoh=config(connect=(endpoint,), domain="car"))
     reader.wait_for("ready")
     writer = peer("write", "writer", "cloud", 1, 200_000, 20, 200, zenoh=config(listen=(endpoint,), domain="car"))
+    writer.wait_for("ready")
     got = [reader.wait_for("read") for _ in range(5)]
     assert all(one["whole"] and one["epoch"] == 0 for one in got)
     assert [one["read"] for one in got] == sorted({one["read"] for one in got})
