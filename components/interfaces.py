@@ -17,11 +17,14 @@ from typing import Any, get_args, get_type_hints
 from ..dag import ConfigFile, DagComponent, ModuleSpec, Process, load_module
 from ..dag.graph import type_name
 from .execution import ExecutionContext
-from .messages import SensorFrame
-from .pipeline import LIDAR_TOPIC
+from .messages import CameraSet, RadarSet, SensorFrame
+from .pipeline import CAMERAS_TOPIC, LIDAR_TOPIC, RADARS_TOPIC
 from .profile import CONF
 
 __all__ = ["TopicInterface", "shipped_topics", "stub_of", "write_interfaces"]
+
+_OF_A_PIPELINE = {LIDAR_TOPIC: SensorFrame, CAMERAS_TOPIC: CameraSet, RADARS_TOPIC: RadarSet}
+"""What a pipeline commits of its source: no module does."""
 
 
 @dataclasses.dataclass
@@ -44,7 +47,7 @@ def _declared(files: Iterable[ConfigFile[ModuleSpec]]) -> list[tuple[str, Proces
     declared = []
     for file in files:
         own = {topic for one in file.content.components for topic in one.outputs.values()}
-        outside = {LIDAR_TOPIC: SensorFrame} | dict.fromkeys(given - own - {LIDAR_TOPIC}, object)
+        outside = _OF_A_PIPELINE | dict.fromkeys(given - own - set(_OF_A_PIPELINE), object)
         declared.append(
             (file.content.module, Process([file], context=ExecutionContext(), external=outside, prepare=False))
         )
@@ -61,7 +64,7 @@ def shipped_topics() -> dict[str, TopicInterface]:
 
 
 def _topics(declared: Iterable[tuple[str, Process]]) -> dict[str, TopicInterface]:
-    topics = {LIDAR_TOPIC: TopicInterface(LIDAR_TOPIC, SensorFrame, ["the source of a pipeline"])}
+    topics = {name: TopicInterface(name, kind, ["the source of a pipeline"]) for name, kind in _OF_A_PIPELINE.items()}
     for module, process in declared:
         for name, component in process.components.items():
             for handle in component.outputs.values():

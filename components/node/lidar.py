@@ -45,6 +45,10 @@ class LidarDriverConfig(ProcessorConfig):
     """Of the simulated street."""
     ahead_s: float = Field(2.0, gt=0.0, le=60.0)
     """How much of the drive is made before it is played [s]."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras of the profile that the simulated vehicle has; null: all that have a mounting."""
+    radars: tuple[str, ...] | None = None
+    """Its radars, likewise."""
     play: Literal["to_and_fro", "once"] = "to_and_fro"
     """to_and_fro: what was made ahead, without end; once: the whole source, at its rate or as fast as it can."""
 
@@ -78,8 +82,17 @@ class LidarDriver(Component):
         self._failure: str | None = None
 
     def init(self, config: LidarDriverConfig) -> None:
-        """Finds out what plays the sensor; nothing is opened before the start."""
+        """Finds out what plays the sensor; nothing is opened before the start.
+
+        Raises:
+            ValueError: The profile has no such camera or radar, or does not say where it is.
+        """
         self._config = config
+        for kind, asked in (("camera", config.cameras), ("radar", config.radars)):
+            known = self._mounted(kind)
+            for name in asked or ():
+                if name not in known:
+                    raise ValueError(f"{kind}s: the profile has no {kind} {name!r} with a mounting, but {list(known)}")
         sensor = (self.context or ExecutionContext()).sensors.get(config.sensor)
         rate = getattr(sensor, "rate_hz", None) or config.rate_hz
         self._period_ns = round(1e9 / rate)
@@ -184,15 +197,20 @@ class LidarDriver(Component):
                 step = -step
             position = min(max(position + step, 0), last)
 
+    def _mounted(self, kind: str) -> dict[str, np.ndarray]:
+        """Vehicle from sensor, of those of a kind in the profile that say where they are."""
+        context = self.context or ExecutionContext()
+        specs = {name: context.sensors[name].mounting for name in context.sensor_kinds.get(kind, ())}
+        return {name: mounting_matrix(at.xyz, at.rpy_deg) for name, at in specs.items() if at is not None}
+
     def _equip(self, source: Any, context: ExecutionContext) -> None:
-        """Gives a simulated vehicle the cameras and radars of the profile, where it says where they are."""
+        """Gives a simulated vehicle the cameras and radars that it is to have."""
         from ..sources.simulated_sensors import mounted_suite
 
-        def mounted(kind: str) -> dict[str, np.ndarray]:
-            specs = {name: context.sensors[name].mounting for name in context.sensor_kinds.get(kind, ())}
-            return {name: mounting_matrix(at.xyz, at.rpy_deg) for name, at in specs.items() if at is not None}
+        def asked(kind: str, names: tuple[str, ...] | None) -> dict[str, np.ndarray]:
+            return {name: at for name, at in self._mounted(kind).items() if names is None or name in names}
 
-        cameras, radars = mounted("camera"), mounted("radar")
+        cameras, radars = asked("camera", self._config.cameras), asked("radar", self._config.radars)
         lidar = getattr(context.sensors.get(self._config.sensor), "mounting", None)
         if lidar is not None and (cameras or radars):
             source.suite = mounted_suite(mounting_matrix(lidar.xyz, lidar.rpy_deg), cameras, radars)

@@ -15,7 +15,7 @@ import pytest
 
 from warploom.components.integration import Integration, integrate
 from warploom.components.interfaces import shipped_topics, stub_of
-from warploom.components.messages import Obstacles, SensorFrame
+from warploom.components.messages import CameraSet, Obstacles, RadarSet, SensorFrame
 from warploom.components.node.transforms import StaticTransforms
 from warploom.errors import ConfigError, WarploomError
 
@@ -96,7 +96,12 @@ def test_topics_know_their_types_producers_and_readers():
     assert "planning_sched/obstacle_intake" in topics["perception/obstacles"].readers
     assert topics["sensor/hesai90/raw"].payload is SensorFrame
     assert topics["vehicle/transforms"].payload is StaticTransforms
-    assert all(topic.producers for topic in topics.values())
+    for name, kind in (("lidar/points", SensorFrame), ("camera/objects", CameraSet), ("radar/objects", RadarSet)):
+        assert topics[name].payload is kind
+        assert topics[name].producers == ["the source of a pipeline"]
+        assert "perception/" in " ".join(topics[name].readers)
+    assert topics["sensor/cameras/objects"].payload is CameraSet
+    assert topics["sensor/radars/objects"].payload is RadarSet
 
 
 def test_a_stub_has_fields_and_methods_without_their_bodies():

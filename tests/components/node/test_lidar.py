@@ -255,3 +255,30 @@ def test_the_simulator_plays_a_sensor():
     assert len(frame.points) > 5_000
     assert frame.ring is not None
     assert int(frame.ring.max()) < 16
+
+
+def equipped(**config):
+    """The names of the cameras and radars that the simulated vehicle gets, of two and one in the profile."""
+
+    class Source:
+        suite = None
+
+    at = MountingSpec(xyz=(1.0, 0.0, 1.5))
+    sensors = {name: SensorSpec(name=name, mounting=at) for name in ("roof", "front", "rear", "radar")}
+    sensors["loose"] = SensorSpec(name="loose")
+    kinds = {"lidar": ("roof",), "camera": ("front", "rear", "loose"), "radar": ("radar",)}
+    context = ExecutionContext(sensors=sensors, sensor_kinds=kinds)
+    driver, source = LidarDriver("driver", context), Source()
+    driver.init(LidarDriverConfig.model_validate({"sensor": "roof", **config}))
+    driver._equip(source, context)
+    return source.suite and (list(source.suite.cameras), list(source.suite.radars))
+
+
+def test_the_simulated_vehicle_has_the_cameras_and_radars_of_the_profile_or_those_asked_for():
+    assert equipped() == (["front", "rear"], ["radar"])
+    assert equipped(cameras=["rear"]) == (["rear"], ["radar"])
+    assert equipped(cameras=["front"], radars=[]) == (["front"], [])
+    assert equipped(cameras=[], radars=[]) is None
+    for name in ("top", "loose"):
+        with pytest.raises(ValueError, match=f"no camera '{name}' with a mounting, but \\['front', 'rear'\\]"):
+            equipped(cameras=[name])
