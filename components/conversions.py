@@ -21,7 +21,7 @@ from .sinks.pcd import encode_pcd
 from .sources.pcd import decode_pcd_columns
 
 if TYPE_CHECKING:
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports]
     import torch
 
 __all__ = ["from_open3d", "from_torch", "read_pcd", "to_open3d", "to_torch", "write_pcd"]
@@ -110,7 +110,7 @@ def to_open3d(cloud: PointCloud) -> open3d.t.geometry.PointCloud:
         ValueError: There is no x, y or z; or as of `PointCloud.to_array`.
         ImportError: Open3D is not installed.
     """
-    import open3d as o3d
+    import open3d as o3d  # pyright: ignore[reportMissingImports]
 
     points = cloud.to_array().reshape(-1)
     xyz = np.ascontiguousarray(_side_by_side(points, _POSITIONS), np.float32)

@@ -141,10 +141,10 @@ def test_graph_draws_a_picture_of_a_module_or_a_whole_profile(warploom):
 
 def test_a_recorded_run_is_replayed_and_played(warploom, monkeypatch):
     output = warploom("record", "--source", "sim:street?seed=7&duration=0.5", "--out", "a.mcap")
-    assert "a.mcap: 5 frames, 20 commits" in output
+    assert "a.mcap: 5 frames, 30 commits" in output
     output = warploom("replay", "a.mcap", "--verify", "--workers", 1, "--workers", 2, "--workers", 8)
     assert output.count("bit-exact: all 15 commits have the recorded hashes") == 3
-    assert "8 workers: given 5 of lidar/points" in output
+    assert "8 workers: given 5 of camera/objects, 5 of lidar/points, 5 of radar/objects" in output
     output = warploom("replay", "a.mcap", "--verify", "--set", "perception.cluster.min_size=11", expect=1)
     assert "NOT bit-exact" in output
     assert "differs" in output
