@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ..dag import Process
+from ..dag import DataProcessComponent, Process
 from ..dag.metrics import Metrics
 from ..dag.replay import produced_topics
 from ..dag.trace import Trace
@@ -88,7 +88,14 @@ class Observer:
         read = {handle.topic for component in process.components.values() for handle in component.inputs.values()}
         self.metrics.watch(process.mesh, sorted(produced | read))
         if self.trace is not None:
-            self.trace.watch(process.mesh, sorted(read - produced), sorted(produced & {OBSTACLES_TOPIC}))
+            # A frame is on its way from where it starts a component; what is only looked at, as a camera's, is none.
+            starting = {
+                component.inputs[name].topic
+                for component in process.components.values()
+                if isinstance(component, DataProcessComponent)
+                for name in component.trigger_inputs
+            }
+            self.trace.watch(process.mesh, sorted(starting - produced), sorted(produced & {OBSTACLES_TOPIC}))
 
     def close(self) -> None:
         """Writes the trace to its end and closes the endpoint."""

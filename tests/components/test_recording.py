@@ -162,7 +162,7 @@ def test_topics_and_files_that_make_no_sense_are_refused(street, tmp_path):
         record_source("nowhere.bin", tmp_path / "a.mcap")
     with pytest.raises(ConfigError, match="'perception/obstacles' cannot be played: a module produces it"):
         play_recording(street, profile="cpu", topics=[OBSTACLES_TOPIC])
-    with pytest.raises(ConfigError, match="cannot be played: it holds lidar/points, "):
+    with pytest.raises(ConfigError, match=r"cannot be played: it holds .*lidar/points, "):
         play_recording(street, topics=["camera/front"])
     with pytest.raises(ConfigError, match="cannot be recorded into itself"):
         play_recording(street, record=street)
