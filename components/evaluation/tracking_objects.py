@@ -321,11 +321,14 @@ def _scans(sequence: TrackingSequence, data: pathlib.Path) -> Iterator[SensorFra
     """The scans of a sequence that are there."""
     from ..sources.scan_files import read_scan
 
-    for path, _, _ in label_files(data, sequence.name):
+    paths = [path for path, _, _ in label_files(data, sequence.name)]
+    for k, path in enumerate(paths):
         number = int(path.stem)
-        at = np.flatnonzero(sequence.frames == number)
+        # A part of a sequence has records of its scans alone, wherever in the sequence these begin.
+        at = [k] if sequence.poses is not None and len(sequence.poses) == len(paths) else []
+        at = at or np.flatnonzero(sequence.frames == number).tolist()
         pose = None
-        if sequence.poses is not None and len(at):
+        if sequence.poses is not None and at:
             pose = sequence.poses[at[0]] @ sequence.renamed_from_lidar
         points = unpack_scan(path) if path.suffix == ".npz" else read_scan(path).points
         yield SensorFrame(
