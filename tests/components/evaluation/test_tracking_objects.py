@@ -1,6 +1,5 @@
 """Scores of a drive whose truth is known, on frames made by hand; and the tracker on them."""
 
-import itertools
 import json
 
 import numpy as np
@@ -162,21 +161,28 @@ def test_velocities_and_ids_through_a_second_of_occlusion():
 
 
 def test_scans_give_poses_to_the_tracker_and_result_files(shared_data, tmp_path, monkeypatch):
-    """The first frames of a sequence: the ego poses of its GPS/IMU records go with the scans."""
+    """A part of a sequence, of which 8 frames are tracked: each scan has the ego pose of its own GPS/IMU record."""
     data = shared_data / "kitti_tracking"
     whole, poses = tracking_objects._scans, []
 
     def first(sequence, folder):
-        for scan in itertools.islice(whole(sequence, folder), 8):
-            poses.append(scan.pose)
-            yield scan
+        scans = list(whole(sequence, folder))
+        poses.extend(scan.pose for scan in scans)
+        yield from scans[:8]
 
     monkeypatch.setattr(tracking_objects, "_scans", first)
     results = tracking_objects.evaluate_scans(data, ["0000"], tmp_path)
-    steps = np.linalg.norm(np.diff([pose[:3, 3] for pose in poses], axis=0), axis=1)
     records = np.loadtxt(data / "oxts" / "0000.txt")
+    assert len(poses) == len(records) == 98
+    turned = [np.arctan2(pose[1, 0], pose[0, 0]) for pose in poses]
+    # Headings say which record a pose is of, without a map projection; 1 mrad: roll and pitch tilt the axes a little.
+    away = np.angle(np.exp(1j * (np.subtract(turned, turned[0]) - (records[:, 5] - records[0, 5]))))
+    np.testing.assert_allclose(away, 0.0, atol=1e-3)
+    assert np.ptp(np.unwrap(turned)) > 0.05
+    steps = np.linalg.norm(np.diff([pose[:3, 3] for pose in poses[:8]], axis=0), axis=1)
     speed = np.hypot(records[:8, 8], records[:8, 9])  # forward and leftward [m/s]
     np.testing.assert_allclose(steps, 0.1 * speed[:7], atol=0.1)  # records are 0.1 s apart, give or take
+    assert not any("pose missing" in reason for result in results for reason in result.dropped)
     assert {result.kind.name for result in results} <= {"Car", "Pedestrian", "Cyclist"}
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert set(summary) == {result.kind.name for result in results}
