@@ -95,7 +95,9 @@ class Observer:
                 if isinstance(component, DataProcessComponent)
                 for name in component.trigger_inputs
             }
-            self.trace.watch(process.mesh, sorted(starting - produced), sorted(produced & {OBSTACLES_TOPIC}))
+            sources, results = starting - produced, produced & {OBSTACLES_TOPIC}
+            others = (read | produced) - sources - results
+            self.trace.watch(process.mesh, sorted(sources), sorted(results), sorted(others))
 
     def close(self) -> None:
         """Writes the trace to its end and closes the endpoint."""

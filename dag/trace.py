@@ -73,19 +73,20 @@ class Trace:
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
 
-    def watch(self, mesh: DataMesh, sources: Iterable[str], results: Iterable[str]) -> None:
+    def watch(self, mesh: DataMesh, sources: Iterable[str], results: Iterable[str], others: Iterable[str] = ()) -> None:
         """Traces the commits of some topics, and every loss of the mesh.
 
         Args:
             mesh: Whose topics they are.
-            sources: Topics that are committed from outside: there the arrows begin.
+            sources: Topics with which a frame begins: there the arrows begin.
             results: Topics with which a frame is done: there they end, and the latency is taken.
+            others: Topics whose commits are shown, and no more: a camera's make no frame that will be done.
         """
-        for topic in sources:
-            on_commit = partial(self._on_commit, topic, False)
+        for topic, phase in [*((topic, "s") for topic in sources), *((topic, "") for topic in others)]:
+            on_commit = partial(self._on_commit, topic, phase)
             self._unsubscribe.append(mesh.window(topic).subscribe(on_commit, lambda *_: None))
         for topic in results:
-            on_commit, on_settle = partial(self._on_commit, topic, True), partial(self._on_settle, mesh, topic)
+            on_commit, on_settle = partial(self._on_commit, topic, "f"), partial(self._on_settle, mesh, topic)
             self._unsubscribe.append(mesh.window(topic).subscribe(on_commit, on_settle))
         mesh.losses.on_loss(partial(self._on_loss, mesh))
 
@@ -93,8 +94,8 @@ class Trace:
         """Takes up the run of a vertex; to be called in its thread."""
         self._add("run", timing)
 
-    def _on_commit(self, topic: str, last: bool, entry: Entry) -> None:
-        self._add("commit", topic, last, entry.version, entry.epoch, entry.received_ns, entry.committed_ns)
+    def _on_commit(self, topic: str, phase: str, entry: Entry) -> None:
+        self._add("commit", topic, phase, entry.version, entry.epoch, entry.received_ns, entry.committed_ns)
 
     def _on_settle(self, mesh: DataMesh, topic: str, version: int, epoch: int) -> None:
         self._add("settle", topic, version, epoch, mesh.clock.monotonic_ns())
@@ -165,19 +166,20 @@ class Trace:
         yield self._arrow(timing.version, timing.epoch, start, here, "t")
 
     def _of_commit(
-        self, topic: str, last: bool, version: int, epoch: int, received: int, committed: int, here: dict[str, Any]
+        self, topic: str, phase: str, version: int, epoch: int, received: int, committed: int, here: dict[str, Any]
     ) -> Iterator[dict[str, Any]]:
         frame, stamp = (epoch, version), committed / 1e3
         what = {"version": version, "epoch": epoch}
         # One nanosecond long: an arrow begins and ends at a slice, and this one must not reach into the next.
         yield {"name": f"commit {topic}", "cat": "commit", "ph": "X", "ts": stamp, "dur": 0.001, **here, "args": what}
-        if last:
-            self._end(frame)
-            yield self._arrow(version, epoch, stamp, here, "f")
-            yield self._counter(f"latency of {topic} [ms]", committed, {"ms": (committed - received) / 1e6})
-        else:
+        if not phase:
+            return
+        yield self._arrow(version, epoch, stamp, here, phase)
+        if phase == "s":
             self._begin(frame)
-            yield self._arrow(version, epoch, stamp, here, "s")
+        else:
+            self._end(frame)
+            yield self._counter(f"latency of {topic} [ms]", committed, {"ms": (committed - received) / 1e6})
         yield self._counter("frames on their way", committed, {"frames": len(self._on_way)})
 
     def _begin(self, frame: tuple[int, int]) -> None:

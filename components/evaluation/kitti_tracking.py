@@ -138,7 +138,8 @@ class TrackingSequence:
         found = found[found[:, 1] == kind.number]
         oxts = data / "oxts" / f"{name}.txt"
         poses, first = None, 0
-        count = int(max(labels[:, 0].max(initial=-1), found[:, 0].max(initial=-1))) + 1
+        # The last frame may hold no object of the type: areas without labels, which most frames have, tell it too.
+        count = int(max(labels[:, 0].max(initial=-1), found[:, 0].max(initial=-1), *dont_care, -1)) + 1
         if oxts.exists():
             records = _numbers(oxts)
             # A part of a sequence has its records alone, the last of which is of the last frame.

@@ -18,7 +18,7 @@ from ...datamesh import DataMesh
 from ...datamesh.clock import Timer
 from ...errors import SinkError
 from ..execution import ExecutionContext
-from ..pipeline import OBSTACLES_TOPIC
+from ..pipeline import LIDAR_TOPIC, OBSTACLES_TOPIC
 
 __all__ = ["TraceWriter", "TraceWriterConfig"]
 
@@ -40,6 +40,8 @@ class TraceWriterConfig(ProcessorConfig):
     """The file; one without a folder lies beside the folders of nodes, such as in $WARPLOOM_RUN."""
     seconds: float = Field(30.0, ge=0.0)
     """How long is traced from the start [s]; 0: nothing. A second of perception is some 100 kB."""
+    sources: tuple[str, ...] = (LIDAR_TOPIC,)
+    """Topics with which a frame begins: it is on its way until it is done. Of others the commits are shown alone."""
     results: tuple[str, ...] = (OBSTACLES_TOPIC,)
     """Topics with which a frame is done: its latency is taken there."""
 
@@ -97,9 +99,11 @@ class TraceWriter(Component):
             self._failure = str(error)
             _log.error("%s: %s", self.name, error)
             return
-        results = [topic for topic in self._config.results if topic in self._mesh.topics()]
-        others = [topic for topic in self._mesh.topics() if topic not in results]
-        self._trace.watch(self._mesh, others, results)
+        topics = self._mesh.topics()
+        sources, results = (
+            [topic for topic in which if topic in topics] for which in (self._config.sources, self._config.results)
+        )
+        self._trace.watch(self._mesh, sources, results, [topic for topic in topics if topic not in sources + results])
         if self.context is not None:
             self.context.timings.watch(self._trace.on_timing)
         self._done = False

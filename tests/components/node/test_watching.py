@@ -79,10 +79,10 @@ def writer(tmp_path, context, **config):
     clock = ManualClock(1_000_000_000)
     mesh = DataMesh(clock=clock)
     one = TraceWriter("tracer", context)
-    mesh.window("a")
-    mesh.window("perception/obstacles")
+    for topic in ("a", "camera", "perception/obstacles"):
+        mesh.window(topic)
     one.bind(mesh, {})
-    settings = TraceWriterConfig.model_validate({"file": str(tmp_path / "{name}.json"), **config})
+    settings = TraceWriterConfig.model_validate({"file": str(tmp_path / "{name}.json"), "sources": ["a"], **config})
     one.check(settings)
     one.init(settings)
     return one, mesh, clock
@@ -93,6 +93,7 @@ def test_the_trace_holds_commits_and_vertices_until_its_time_is_over(tmp_path):
     one, mesh, clock = writer(tmp_path, context, seconds=5)
     one.start()
     commit(mesh, "a", 1)
+    commit(mesh, "camera", 1_000)
     context.timings(timing())
     commit(mesh, "perception/obstacles", 1)
     clock.advance(6_000_000_000)
@@ -102,6 +103,8 @@ def test_the_trace_holds_commits_and_vertices_until_its_time_is_over(tmp_path):
     events = json.loads((tmp_path / "tracer.json").read_text())
     names = [event["name"] for event in events]
     assert names.count("commit a") == 1
+    assert names.count("commit camera") == 1
+    assert [event["args"]["frames"] for event in events if event["name"] == "frames on their way"] == [1, 0]
     assert names.count("perception.cluster") == 1
     assert "commit perception/obstacles" in names
     assert one.idle_because == "the first 5 s are written"

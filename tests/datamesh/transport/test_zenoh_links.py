@@ -153,7 +153,9 @@ def test_a_reader_that_hangs_loses_the_oldest_and_they_are_counted(hosts):
         assert hangs.wait(30)
         for version in range(2, 21):
             writer.commit("topic", version, version)
-        reader.until(lambda counts: counts.get("slow", 0) == 16, "topic")
+            # One by one: in a burst zenoh itself drops at the sender what its queue has no room for.
+            reader.until(lambda counts, slow=version - 4: counts.get("slow", 0) >= slow, "topic")
+        assert reader.counts("topic")["slow"] == 16
     finally:
         go_on.set()
     assert received(reader, 4).versions == (1, 18, 19, 20)
