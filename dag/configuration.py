@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import pkgutil
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_origin
@@ -27,9 +29,14 @@ _ENVIRONMENT_PREFIX = "WARPLOOM__"
 def nearest(name: str, known: Iterable[str]) -> str:
     """A hint for a message: the known name most like `name`, and all that are known."""
     known = sorted(str(k) for k in known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}known: {', '.join(known) or 'none'}"
+    hint = _closest(name, known)
+    return f"{hint + ' ' if hint else ''}known: {', '.join(known) or 'none'}"
+
+
+def _closest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+    """A question after the known name most like one; nothing where none is."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
+    return f"did you mean {close[0]!r}?" if close else ""
 
 
 def _read(text: str) -> tuple[yaml.Node | None, Any]:
@@ -175,6 +182,8 @@ class ConfigFile(Generic[M]):
                 hint = hint_for_value(found, unit)
                 if unit is not None and isinstance(found, (int, float)):
                     expected += f" [{unit}]"
+                if problem["type"] == "literal_error" and isinstance(found, str):
+                    hint = _closest(found, re.findall(r"'([^']*)'", expected))
                 found = type(found).__name__ if isinstance(found, (dict, list)) else repr(found)
                 told = f", found {found}" if problem["type"] != "value_error" else ""
                 lines.append(f"{where}: {expected}{told}" + (f"; {hint}" if hint else ""))
@@ -288,11 +297,24 @@ def import_class(dotted: str) -> type:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        raise ConfigError(f"cannot import {module_name!r}: {error}; is its folder on PYTHONPATH?") from error
+        hint = _closest(module_name, _modules_beside(module_name), cutoff=0.65)
+        way_out = f"{hint} or " if hint else ""
+        raise ConfigError(f"cannot import {module_name!r}: {error}; {way_out}is its folder on PYTHONPATH?") from error
     except Exception as error:
         raise ConfigError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
-        classes = [name for name, value in vars(module).items() if isinstance(value, type)]
+        known = {name: value for name, value in vars(module).items() if isinstance(value, type)}
+        classes = [name for name, value in known.items() if value.__module__.startswith(module_name)] or list(known)
         raise ConfigError(f"module {module_name!r} has no class {class_name!r}; {nearest(class_name, classes)}")
     return found
+
+
+def _modules_beside(dotted: str) -> list[str]:
+    """Dotted names of the modules in the package that a module would be in; of all there are where that is none."""
+    package, _, _ = dotted.rpartition(".")
+    try:
+        path = importlib.import_module(package).__path__ if package else None
+    except (ImportError, AttributeError):
+        return []
+    return [f"{package}.{one.name}" if package else one.name for one in pkgutil.iter_modules(path)]

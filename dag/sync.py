@@ -12,6 +12,7 @@ from pydantic import Field
 
 from ..datamesh import CURRENT_EPOCH, CommitPolicy, Entry, EqualVersion, Input, Outcome, Reorder, Status, Waiting
 from ..datamesh.payload import holds_device_array
+from .configuration import nearest
 from .processor import In, Out, Processor, ProcessorConfig
 from .trigger import Trigger
 
@@ -20,8 +21,7 @@ __all__ = ["AlignDagProcessor", "Aligned", "CommitDagProcessor", "GetRecentDagPr
 
 def _input_of(processor: Processor, name: str) -> Input:
     if name not in processor.component_inputs:
-        known = ", ".join(processor.component_inputs) or "none"
-        raise ValueError(f"the component has no input {name!r}; it has: {known}")
+        raise ValueError(f"the component has no input {name!r}; {nearest(name, processor.component_inputs)}")
     return processor.component_inputs[name]
 
 
@@ -258,8 +258,8 @@ class CommitDagProcessor(Processor):
     def check(self, config: _CommitConfig) -> None:
         """Looks whether the component has the output."""
         if config.output not in self.component_outputs:
-            known = ", ".join(self.component_outputs) or "none"
-            raise ValueError(f"the component has no output {config.output!r}; it has: {known}")
+            known = nearest(config.output, self.component_outputs)
+            raise ValueError(f"the component has no output {config.output!r}; {known}")
 
     def init(self, config: _CommitConfig) -> None:
         """Finds the output."""

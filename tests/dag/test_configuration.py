@@ -116,6 +116,7 @@ def test_keys_have_lines_and_what_is_not_there_that_of_its_parent(write, keys, l
         ("capacity: 20", "capacity: [1, 2]", 2, "found list"),
         ("max_age: 3", "max_age: -3", 4, "tracker.max_age: Input should be greater than or equal to 0, found -3"),
         ("kind: none", "kind: particle", 12, "sensors.1.kind: Input should be 'kalman' or 'none', found 'particle'"),
+        ("kind: none", "kind: kalmann", 12, "found 'kalmann'; did you mean 'kalman'?"),
         ("gate: 1.5", "gate: -1.5", 3, "tracker: gate must be >= 0"),
         ("tracker:\n", "tracker: 5\nmore:\n", 3, "tracker: Input should be a valid dictionary"),
         ("capacity: 20", "capacity: 20\ncapacity: 30", 3, "key 'capacity' stands twice in one mapping"),
@@ -312,6 +313,10 @@ def test_a_class_is_imported_from_warploom_or_from_a_package_of_the_users_own(tm
         ("def f(:", "MODULE.Ground", "cannot import 'MODULE': SyntaxError"),
         ("1 / 0", "MODULE.Ground", "cannot import 'MODULE': ZeroDivisionError: division by zero"),
         ("import not_there_at_all", "MODULE.Ground", "No module named 'not_there_at_all'"),
+        ("", "warploom.dag.proccessor.In", "cannot import 'warploom.dag.proccessor'"),
+        ("", "warploom.dag.proccessor.In", "did you mean 'warploom.dag.processor'?"),
+        ("", "MODULEs.Ground", "did you mean 'MODULE'?"),
+        ("from pathlib import Path\nclass Ground: pass", "MODULE.Grund", "did you mean 'Ground'? known: Ground"),
     ],
 )
 def test_a_class_that_cannot_be_had_is_told_with_the_reason(source, name, said, tmp_path, monkeypatch, request):

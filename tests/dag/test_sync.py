@@ -154,12 +154,20 @@ def test_without_a_value_nothing_is_published():
 @pytest.mark.parametrize(
     ("processor", "config", "said"),
     [
-        (CommitDagProcessor, {"output": "rseult"}, "the component has no output 'rseult'; it has: result"),
-        (GetRecentDagProcessor, {"input": "camra"}, "the component has no input 'camra'; it has: camera"),
+        (
+            CommitDagProcessor,
+            {"output": "rseult"},
+            "the component has no output 'rseult'; did you mean 'result'. known: result",
+        ),
+        (
+            GetRecentDagProcessor,
+            {"input": "camra"},
+            "the component has no input 'camra'; did you mean 'camera'. known: camera",
+        ),
         (
             AlignDagProcessor,
             {"inputs": ["camera", "x"], "timeout_ms": 1},
-            "the component has no input 'x'; it has: camera",
+            "the component has no input 'x'; known: camera",
         ),
     ],
 )
