@@ -90,7 +90,7 @@ MISTAKES = {
     "an unknown port": ("in: {value: detected}", "in: {valeu: detected}", 21,
         "commit.in.valeu: warploom.dag.CommitDagProcessor has no such port; did you mean 'value'? known: value"),
     "an unknown output": ("config: {output: detected}", "config: {output: detcted}", 22,
-        "the component has no output 'detcted'; it has: detected"),
+        "the component has no output 'detcted'; did you mean 'detected'? known: detected"),
     "a value with a unit": ("radius: 0.5", "radius: 50 cm", 16,
         "cluster.config.radius: Input should be a valid number, unable to parse string as a number, found '50 cm'; "
         "this is in m, so write 0.5"),
