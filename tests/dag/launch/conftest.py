@@ -1,6 +1,7 @@
 """What the tests of the launcher share: nodes in a run folder of the test's own, and files to launch."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -11,6 +12,14 @@ PARTS = Path(__file__).parent / "parts"
 sys.path.insert(0, str(PARTS))
 
 from launch_nodes import Node  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def interruptible():
+    """SIGINT works, here and in the nodes: a shell has what runs in its background ignore it, and that is inherited."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

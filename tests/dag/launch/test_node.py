@@ -295,12 +295,13 @@ def test_a_queue_that_fills_drops_what_it_must_and_counts_it(start, module, laun
 
 def test_a_process_is_what_the_launch_file_says_and_no_more(start, module, launch_file, tmp_path):
     plain = module(PLAIN, "plain", config=f"{{path: {tmp_path / 'notes'}}}")
+    cgroup = f"warploom-test-{os.getpid()}/one"
     keys = {
         "cpus": [0],
         "nice": 7,
         "environment": {"WARPLOOM_TEST": 5},
         "process_name": "compute3d_scheduler",
-        "cgroup": "warploom-test/one",
+        "cgroup": cgroup,
     }
     other = {"modules": [module(PLAIN, "other")], "cpus": [1000], "nice": -20}
     node = start("launch", launch_file(one={"modules": [plain], **keys}, two=other)).up()
@@ -310,8 +311,8 @@ def test_a_process_is_what_the_launch_file_says_and_no_more(start, module, launc
     assert child.nice() == 7
     assert child.environ()["WARPLOOM_TEST"] == "5"
     assert Path(f"/proc/{pid}/comm").read_text().strip() == "compute3d_sched"  # 15 bytes, as the system has it
-    joined = "warploom-test/one" in Path(f"/proc/{pid}/cgroup").read_text()
-    warned = any("cgroup warploom-test/one" in event["message"] for event in node.find("warning"))
+    joined = cgroup in Path(f"/proc/{pid}/cgroup").read_text()
+    warned = any(f"cgroup {cgroup}" in event["message"] for event in node.find("warning"))
     assert joined != warned
     # What is not permitted, or not there, is a warning; the process runs.
     assert any("cpus [1000]: " in message for message in node.process("two")["warnings"])
@@ -325,4 +326,4 @@ def test_a_process_is_what_the_launch_file_says_and_no_more(start, module, launc
     assert node.wait() == 0
     notes = [line.split()[0] for line in (tmp_path / "notes").read_text().splitlines()]
     assert notes == ["start", "stop", "start", "stop"]
-    assert not any(Path("/sys/fs/cgroup").glob("**/warploom-test"))
+    assert not any(Path("/sys/fs/cgroup").glob(f"**/{Path(cgroup).parent}"))
