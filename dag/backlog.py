@@ -52,6 +52,8 @@ class Backlog:
         """What waits, the oldest first: to be looked at."""
         self.on_taken: Callable[[Trigger], None] | None = None
         """Is told of each frame that is taken, in the thread that takes it."""
+        self.gives_way: Callable[[], bool] = lambda: False
+        """Whether it takes more than it has room for, rather than let a producer wait; `look_again` as that changes."""
         self._frames = 0  # of those that wait, the ones that are not settled
         self._lock = threading.Lock()
         self._room = threading.Condition(self._lock)
@@ -90,6 +92,8 @@ class Backlog:
     def _make_room(self, trigger: Trigger) -> tuple[Trigger | None, str]:
         """Makes room, or waits for it: what is dropped, and why. Called with the lock held."""
         while self._blocks and not trigger.settled and self._frames >= self._depth and not self._closed:
+            if self.gives_way():
+                return None, "backlog"
             self._room.wait()
         if self._closed:
             return trigger, "shutdown"
@@ -134,6 +138,11 @@ class Backlog:
         if self.on_taken is not None:
             self.on_taken(trigger)
         return trigger
+
+    def look_again(self) -> None:
+        """Lets producers that wait for room see whether it gives way."""
+        with self._lock:
+            self._room.notify_all()
 
     def close(self) -> None:
         """Takes nothing more; what waits can still be taken."""

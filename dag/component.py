@@ -13,6 +13,7 @@ from ..datamesh import (
     CURRENT_EPOCH,
     Clock,
     DataMesh,
+    Entry,
     Input,
     LossCounters,
     Output,
@@ -26,6 +27,7 @@ from .deadline import DeadlineConfig, FrameDeadline
 from .engine import GraphEngine, Run, Vertex, VertexTiming
 from .logs import component_logger
 from .processor import ProcessorConfig
+from .recorded_reads import Awaited
 from .trigger import Trigger, TriggerConfig
 from .triggering import AllTrigger, AnyTrigger, TimeTrigger, TriggerSource
 
@@ -219,14 +221,19 @@ class DataProcessComponent(Component):
         """Whether its inputs trigger together, at the versions of the first."""
         return isinstance(self._source, AllTrigger)
 
-    def follow(self, wanted: Container[tuple[int, int]]) -> None:
+    def follow(self, wanted: Container[tuple[int, int]], awaited: Awaited) -> None:
         """Lets a replay give the triggers: from here on those of the mesh and of time start no run.
 
         Args:
             wanted: Epochs and versions that will be given; the other versions of the mesh are settled.
+            awaited: Whether something in the replay waits for what is still to be played.
         """
         # It blocks, also where ticks of time would replace each other: nothing of what is given may be lost.
         self.backlog = Backlog(self.name, BacklogConfig(policy="block"), self.losses)
+        self.backlog.gives_way = awaited.__bool__
+        awaited.on_first.append(self.backlog.look_again)
+        # Nor may the thread that plays serve a run which waits for what it plays next.
+        self._inline = self._runs_later = False
         self._source.offer = partial(self._offer_unwanted, wanted)
         if not self.trigger_inputs:
             self._source = TriggerSource(self._offer)
@@ -237,8 +244,13 @@ class DataProcessComponent(Component):
         elif (trigger.epoch, trigger.version) not in wanted:
             self.settle(trigger.version, trigger.epoch)
 
-    def give(self, trigger: Trigger) -> None:
-        """Gives a trigger to a component that follows a replay; waits until there is room for it."""
+    def give(self, trigger: Trigger, data: Mapping[str, Entry]) -> None:
+        """Gives a trigger to a component that follows a replay; waits until there is room for it.
+
+        Args:
+            trigger: Of the log.
+            data: What triggered, by input: it may leave the window before the run.
+        """
         self._offer(trigger)
         self._advance()
 
@@ -366,6 +378,7 @@ class DagComponent(DataProcessComponent):
         self._deadline: DeadlineConfig | None = None
         self._closed = self._stopping = False
         self._submitting = threading.Lock()
+        self._given: dict[tuple[int, int], Mapping[str, Entry]] = {}
         self._free = 1
         self._slots = threading.Lock()
         self._idle = threading.Condition(self._slots)
@@ -398,6 +411,11 @@ class DagComponent(DataProcessComponent):
     def at_work(self) -> dict[str, int]:
         """The vertices that are at work now, and the versions that they are at work on."""
         return {} if self._engine is None else self._engine.running()
+
+    def give(self, trigger: Trigger, data: Mapping[str, Entry]) -> None:
+        """Gives a trigger to a component that follows a replay, with its data."""
+        self._given[trigger.epoch, trigger.version] = data
+        super().give(trigger, data)
 
     def start(self) -> None:
         """Starts the workers. After a stop, initialises the processors once more first."""
@@ -487,8 +505,9 @@ class DagComponent(DataProcessComponent):
     def _data(self, trigger: Trigger) -> dict[str, Any] | None:
         """The data that triggered, by input; None, counted, where they are gone."""
         data: dict[str, Any] = {}
+        given = self._given.pop((trigger.epoch, trigger.version), {}) if self._given else {}
         for name, version in trigger.inputs.items():
-            entry = self._windows[name].find(version, trigger.epoch)
+            entry = given.get(name) or self._windows[name].find(version, trigger.epoch)
             if entry is None:
                 miss = self._windows[name].snapshot(trigger.epoch).miss(version)
                 self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)

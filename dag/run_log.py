@@ -8,23 +8,25 @@ in a recording beside the data.
 from __future__ import annotations
 
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from ..datamesh import Miss, Outcome, Status
+from ..datamesh import Entry, Miss, Outcome, Status
 from ..datamesh.recording import READS, RUNS, RecordedEvent
 from .component import DagComponent, DataProcessComponent
 from .engine import VertexTiming
 from .process import Process
-from .recorded_reads import Read, RecordedReads
+from .recorded_reads import Awaited, Read, RecordedReads
 from .trigger import Trigger
 
 __all__ = ["RecordedRuns", "RunLog"]
 
 _Order = tuple[int, int]
+_Datum = tuple[str, int, int]
+"""Input, epoch and version."""
 Log = Callable[[str, int, int, object], None]
 
 
@@ -60,6 +62,10 @@ class _Taken:
     given: int = 0
     released: int = 0
     """Those without inputs, which time triggered, are given when the replay gets to where they were taken."""
+    kept: dict[_Datum, Entry] = field(default_factory=dict)
+    """What triggers those that are still to be given, as far as it is there."""
+    needed: Counter[_Datum] = field(default_factory=Counter)
+    """How many of them each datum triggers."""
     lock: threading.RLock = field(default_factory=threading.RLock)
 
 
@@ -97,18 +103,21 @@ class RecordedRuns:
 
     def apply(self, process: Process) -> None:
         """Makes a process that has not started take the triggers of the log, and read what it says."""
+        awaited = Awaited()
         for component in process.components.values():
             taken = self._taken.get(component.name)
             if not isinstance(component, DataProcessComponent) or taken is None or component.backlog is None:
                 continue
-            component.follow({(epoch, version) for epoch, version, _ in taken.runs})
+            component.follow({(epoch, version) for epoch, version, _ in taken.runs}, awaited)
+            for epoch, _, inputs in taken.runs:
+                taken.needed.update((name, epoch, version) for name, version in inputs.items())
             for name in component.trigger_inputs:
-                give = partial(self._on_event, component)
-                component.inputs[name].window.subscribe(give, give)
+                on_commit, on_settle = partial(self._on_commit, component, name), partial(self._on_settle, component)
+                component.inputs[name].window.subscribe(on_commit, on_settle)
         for component in process.components.values():
             for vertex in component.vertices if isinstance(component, DagComponent) else ():
                 place = f"{component.name}.{vertex.name}"
-                recorded = RecordedReads(self._reads[place], component.inputs)
+                recorded = RecordedReads(self._reads[place], component.inputs, awaited)
                 vertex.processor.recorded, vertex.left_out = recorded, recorded.left_out
 
     def on_played(self, event: RecordedEvent, process: Process) -> None:
@@ -121,7 +130,13 @@ class RecordedRuns:
             self._taken[name].released += 1
             self._give(component)
 
-    def _on_event(self, component: DataProcessComponent, *_: object) -> None:
+    def _on_commit(self, component: DataProcessComponent, name: str, entry: Entry) -> None:
+        taken, datum = self._taken[component.name], (name, entry.epoch, entry.version)
+        if datum in taken.needed:
+            taken.kept[datum] = entry
+        self._give(component)
+
+    def _on_settle(self, component: DataProcessComponent, version: int, epoch: int) -> None:
         self._give(component)
 
     def _give(self, component: DataProcessComponent) -> None:
@@ -130,30 +145,33 @@ class RecordedRuns:
         with taken.lock:
             while taken.given < len(taken.runs):
                 epoch, version, inputs = taken.runs[taken.given]
-                received = self._received(component, epoch, inputs)
-                if received is None or (not inputs and taken.given >= taken.released):
+                if not inputs and taken.given >= taken.released:
+                    return
+                data = {name: taken.kept.get((name, epoch, at)) for name, at in inputs.items()}
+                missing = [name for name, entry in data.items() if entry is None]
+                gone = any(_is_gone(component, name, epoch, inputs[name]) for name in missing)
+                if missing and not gone:
                     return
                 taken.given += 1
-                if received < 0:
+                for datum in ((name, epoch, at) for name, at in inputs.items()):
+                    taken.needed[datum] -= 1
+                    if not taken.needed[datum]:
+                        del taken.needed[datum]
+                        taken.kept.pop(datum, None)
+                if gone:
                     component.losses.count(component.name, "not replayed", version)
                     component.settle(version, epoch)
                     continue
                 now = component.clock.monotonic_ns()
-                trigger = Trigger(version, received or now, False, epoch, now, inputs)
-                component.give(trigger)
+                entries = {name: entry for name, entry in data.items() if entry is not None}
+                received = next((entry.received_ns for entry in entries.values()), 0) or now
+                component.give(Trigger(version, received, False, epoch, now, inputs), entries)
 
-    @staticmethod
-    def _received(component: DataProcessComponent, epoch: int, inputs: Mapping[str, int]) -> int | None:
-        """When what triggered was received; None where it is not there yet, negative where it is gone."""
-        received = 0
-        for name, version in inputs.items():
-            snapshot = component.inputs[name].window.snapshot(epoch)
-            index = snapshot.version_index(version) if snapshot.epoch == epoch else -1
-            if index < 0:
-                gone = (Miss.EVICTED, Miss.SETTLED_EMPTY)
-                return -1 if snapshot.epoch == epoch and snapshot.miss(version) in gone else None
-            received = received or snapshot.entry(index).received_ns
-        return received
+
+def _is_gone(component: DataProcessComponent, name: str, epoch: int, version: int) -> bool:
+    """Whether what triggered the recorded run cannot come in the replay."""
+    snapshot = component.inputs[name].window.snapshot(epoch)
+    return snapshot.epoch == epoch and snapshot.miss(version) in (Miss.EVICTED, Miss.SETTLED_EMPTY)
 
 
 def _read(recorded: Any, first: int) -> Read:

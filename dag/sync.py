@@ -78,15 +78,16 @@ class GetRecentDagProcessor(Processor):
 
     def begin(self, trigger: Trigger, resume: Callable[[], None]) -> bool:
         """Waits in a replay alone, for what the recorded run read."""
-        read = None if self.recorded is None else self.recorded.of(trigger).get(self._name)
-        if not isinstance(read, tuple):
+        recorded = self.recorded
+        read = None if recorded is None else recorded.of(trigger).get(self._name)
+        if recorded is None or not isinstance(read, tuple):
             return False
 
         def begin(on_end: Callable[[Waiting], None]) -> Waiting:
             self._recorded = self._input.when(read[1], on_end, epoch=read[0])
             return self._recorded
 
-        return _begin_waits([begin], resume)
+        return recorded.wait(partial(_begin_waits, [begin]), resume)
 
     def process(self, trigger: Trigger) -> Status:
         """Gives value and version, or neither, which is a MISS."""
@@ -194,7 +195,8 @@ class AlignDagProcessor(Processor):
             return waiting
 
         names = [name for name in self._inputs if recorded is None or name in recorded]
-        return _begin_waits([partial(begin, name) for name in names], resume)
+        waits = partial(_begin_waits, [partial(begin, name) for name in names])
+        return waits(resume) if self.recorded is None else self.recorded.wait(waits, resume)
 
     def process(self, trigger: Trigger) -> Status:
         """Gives what was found. OK if all was; else SHUTDOWN, TIMEOUT or MISS, and what is absent is counted."""

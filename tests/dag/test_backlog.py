@@ -193,3 +193,27 @@ def test_who_takes_a_frame_is_told_and_settled_versions_are_none():
     assert [backlog.take().version, backlog.take_now().version, backlog.take_now().version] == [1, 2, 3]
     assert backlog.take_now() is None
     assert told == [1, 3]
+
+
+def test_one_that_gives_way_takes_more_than_it_has_room_for_and_loses_nothing():
+    losses = LossCounters()
+    backlog = Backlog("component", BacklogConfig(policy="block"), losses)
+    gives_way = []
+    backlog.gives_way = lambda: bool(gives_way)
+    backlog.offer(Trigger(0))
+    producer = threading.Thread(target=lambda: [backlog.offer(Trigger(version)) for version in range(1, 4)])
+    producer.start()
+    producer.join(0.05)
+    assert producer.is_alive(), "there is no room"
+    gives_way.append(True)
+    backlog.look_again()
+    producer.join(10)
+    assert not producer.is_alive()
+    assert [trigger.version for trigger in backlog.waiting] == [0, 1, 2, 3]
+    gives_way.clear()
+    producer = threading.Thread(target=backlog.offer, args=(Trigger(4),))
+    producer.start()
+    taken = [backlog.take().version for _ in range(5)]
+    producer.join(10)
+    assert taken == [0, 1, 2, 3, 4]
+    assert losses.as_dict() == {}

@@ -164,6 +164,52 @@ ALIGN = (
     "config: {inputs: [map], timeout_ms: 4}}\n"
     f"      sum: {{processor: {__name__}.SlowSum}}\n"
 )
+FIFO = ("backlog: {policy: latest}", "backlog: {policy: fifo, depth: 20}")
+
+
+def feed_maps_when_all_frames_wait(mesh):
+    """Twenty frames are in the backlog when the datum comes that the later ones of them read."""
+    feed(mesh, "sensor/value", range(1, 21))
+    time.sleep(0.002)
+    feed(mesh, "sensor/map", [0])
+    feed(mesh, "sensor/map", range(1, 21))
+    wait_for_sum(mesh, 20)
+
+
+def test_what_weak_sync_read_may_have_come_after_frames_that_waited_behind_it(write, tmp_path, monkeypatch):
+    """The player must get past them to what the first is to read, however few may be in flight."""
+    monkeypatch.setattr(SlowSum, "process", paced(SlowSum.process))
+    text = module(RECENT, inputs=BOTH).replace(*FIFO)
+    recording, losses = check(write, tmp_path, text, feed_maps_when_all_frames_wait, monkeypatch, commits=20)
+    assert "sums" not in losses
+    assert len([event for event in recording if event.topic == READS]) > 10
+
+
+def test_what_strong_sync_waited_for_may_have_come_after_frames_that_waited_behind_it(write, tmp_path, monkeypatch):
+    text = module(ALIGN.replace("timeout_ms: 4", "timeout_ms: 10000"), inputs=BOTH).replace(*FIFO)
+    check(write, tmp_path, text, feed_maps_when_all_frames_wait, monkeypatch, commits=20)
+
+
+def paced(process):
+    """A process that takes two milliseconds more in a run that is recorded."""
+
+    def slower(self, trigger):
+        time.sleep(0.002 if self.slow else 0.0)
+        return process(self, trigger)
+
+    return slower
+
+
+def test_what_triggered_is_kept_though_a_hundred_others_come_before_its_turn(write, tmp_path, monkeypatch):
+    """The window keeps 32 versions. Those that the backlog dropped pass in no time, while a frame is at work."""
+    text = module(SUM).replace("in_flight: 2", "in_flight: 1")
+    monkeypatch.setattr(SlowSum, "process", paced(SlowSum.process))
+    recording, losses = record(write, tmp_path, text, lambda mesh: feed(mesh, "sensor/value", range(1000), 0.00005))
+    assert losses["sums"]["backlog"] > 500
+    process = Process([load_module(write(text))], external=OUTSIDE, offline=True)
+    result = Replay(recording, process).run()
+    assert result.good, result.differences
+    assert process.mesh.losses.as_dict() == {}
 
 
 def test_strong_sync_ends_its_waits_as_in_the_recorded_run(write, tmp_path, monkeypatch):
