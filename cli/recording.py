@@ -63,7 +63,7 @@ def play(
     file: Annotated[Path, typer.Argument(help="A recording made by `record`.")],
     rate: Annotated[float | None, typer.Option(help="Speed; 2 is twice as fast as it was.")] = 1.0,
     fast: Annotated[bool, typer.Option("--fast", help="As fast as it goes, without losing anything.")] = False,
-    seek: Annotated[float, typer.Option(min=0.0, help="Begin here [s].")] = 0.0,
+    seek: Annotated[float, typer.Option(min=0.0, help="Begin so long after the recording's beginning [s].")] = 0.0,
     loop: Annotated[int, typer.Option(min=0, help="Play it so often; 0: until interrupted.")] = 1,
     step: Annotated[bool, typer.Option("--step", help="Wait for Enter before each version; q ends.")] = False,
     topics: Annotated[list[str] | None, typer.Option("--topic", help="A topic to play; by default all.")] = None,

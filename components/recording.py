@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -257,14 +257,23 @@ def replay_lines(workers: int | None, result: ReplayResult, changed: Sequence[st
     return lines
 
 
-def _held_by(recording: Recording) -> tuple[list[str], dict[str, tuple[int, int]]]:
-    """The topics of which values are in a recording, and the lowest and the highest version of each."""
-    versions: dict[str, tuple[int, int]] = {}
+def _held_by(recording: Recording) -> dict[str, dict[int, tuple[int, int]]]:
+    """The topics of which values are in a recording; of each, by epoch, the lowest and the highest version."""
+    held: dict[str, dict[int, tuple[int, int]]] = {}
     for event in recording:
         if event.payload is not None:
-            first, last = versions.get(event.topic, (event.version, event.version))
-            versions[event.topic] = min(first, event.version), max(last, event.version)
-    return sorted(versions), versions
+            versions = held.setdefault(event.topic, {})
+            first, last = versions.get(event.epoch, (event.version, event.version))
+            versions[event.epoch] = min(first, event.version), max(last, event.version)
+    return dict(sorted(held.items()))
+
+
+def _first_epoch(held: Iterable[Mapping[int, tuple[int, int]]]) -> tuple[int, int]:
+    """The lowest and the highest version of some topics in the first epoch that one of them has."""
+    spans = list(held)
+    first = min((epoch for span in spans for epoch in span), default=0)
+    within = [span[first] for span in spans if first in span]
+    return min((low for low, _ in within), default=0), max((high for _, high in within), default=0)
 
 
 @dataclass
@@ -302,7 +311,7 @@ def play_recording(
         settings: Changes by dotted key, as texts `key=value`.
         topics: What to publish; by default all that nobody else produces.
         rate: Speed, > 0; None: as fast as the modules take it, which then lose nothing.
-        seek: Where to begin [s].
+        seek: Where to begin [s], after the lowest version of the first epoch, whichever topics of it are played.
         loops: How often; None: until interrupted.
         record: Record all topics, those of the modules too, into this file.
         on_event: Called before each event is published; False ends the playing.
@@ -316,7 +325,7 @@ def play_recording(
         what = "--set" if settings else "--device"
         raise ConfigError(f"{what} changes nothing without --profile: a recording alone is published as it is")
     recording = Recording(path)
-    known, versions = _held_by(recording)
+    held = _held_by(recording)
     with ExitStack() as stack:
         mesh, process, pipeline = DataMesh(), None, None
         if profile is not None:
@@ -325,17 +334,15 @@ def play_recording(
             mesh = process.mesh
         produced = produced_topics(process) if process is not None else set()
         for topic in topics:
-            if topic not in known or topic in produced:
-                why = "a module produces it" if topic in produced else f"it holds {', '.join(known) or 'nothing'}"
+            if topic not in held or topic in produced:
+                why = "a module produces it" if topic in produced else f"it holds {', '.join(held) or 'nothing'}"
                 raise ConfigError(f"{path}: topic {topic!r} cannot be played: {why}")
-        played = list(topics) or [
-            topic for topic in known if topic not in produced and not topic.startswith("warploom/")
-        ]
-        span = max((versions[topic][1] for topic in played), default=0) - min(
-            (versions[topic][0] for topic in played), default=0
-        )
-        if played and span < seek * 1e9:
-            raise ConfigError(f"{path}: --seek {seek:g} is beyond its end, {span / 1e9:.2f} s after its beginning")
+        playable = [topic for topic in held if topic not in produced and not topic.startswith("warploom/")]
+        played = list(topics) or playable
+        beginning, end = _first_epoch([held[topic] for topic in playable])
+        if playable and end - beginning < seek * 1e9:
+            span = (end - beginning) / 1e9
+            raise ConfigError(f"{path}: --seek {seek:g} is beyond its end, {span:.2f} s after its beginning")
         drain = Drain(process, played) if process is not None else None
         recorder = None
         if record is not None:
@@ -355,6 +362,7 @@ def play_recording(
             played,
             rate=rate,
             seek=seek,
+            beginning=beginning,
             loops=loops,
             before_epoch=drain.wait if drain is not None else lambda: None,
             on_event=on_event,

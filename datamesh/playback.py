@@ -16,6 +16,8 @@ from .recording_reader import Recording
 
 __all__ = ["Player"]
 
+_PUBLISHED = (EventKind.COMMIT, EventKind.SETTLE)
+
 _log = logging.getLogger(__name__)
 
 
@@ -35,6 +37,7 @@ class Player:
         *,
         rate: float | None = 1.0,
         seek: float = 0.0,
+        beginning: int | None = None,
         loops: int | None = 1,
         before_epoch: Callable[[], None] = lambda: None,
         on_event: Callable[[RecordedEvent], bool] = lambda event: True,
@@ -47,7 +50,8 @@ class Player:
             mesh: Where to.
             topics: Which of its topics.
             rate: Speed, > 0; None: as fast as the mesh takes it.
-            seek: Where to begin [s], ≥ 0, from the lowest version of the first epoch.
+            seek: Where to begin [s], ≥ 0, after `beginning`, each time anew; later epochs are played whole.
+            beginning: The version from which `seek` counts [ns]; None: the lowest of these topics in the first epoch.
             loops: How often to play it; None: until `stop`.
             before_epoch: Called before each new epoch.
             on_event: Called before each event is published; False ends the playing, so a caller can step.
@@ -66,6 +70,7 @@ class Player:
         self._mesh = mesh
         self._rate = rate
         self._seek_ns = round(seek * 1e9)
+        self._beginning = beginning
         self._loops = loops
         self._before_epoch = before_epoch
         self._on_event = on_event
@@ -92,6 +97,8 @@ class Player:
             SourceError: The recording cannot be read any more.
         """
         done = 0
+        if self._seek_ns and self._beginning is None:
+            self._beginning = self._lowest()
         while (self._loops is None or done < self._loops) and not self._stopping.is_set():
             published = self.published.total()
             self._once(self._epoch + 1 if done else 0)
@@ -99,20 +106,25 @@ class Player:
             if self.published.total() == published:  # a recording without events would loop for ever
                 return
 
+    def _lowest(self) -> int:
+        """The lowest version of the first epoch: what is committed first need not have it."""
+        orders = [(e.epoch, e.version) for e in self._recording if e.topic in self._outputs and e.kind in _PUBLISHED]
+        return min(orders, default=(0, 0))[1]
+
     def _once(self, offset: int) -> None:
         """Plays it once; its first epoch becomes the epoch `offset` of the mesh."""
         base: int | None = None
-        beginning = origin = 0
-        start = 0.0
+        first = (self._beginning or 0) + self._seek_ns
+        origin, start = 0, 0.0
         newest: dict[str, tuple[int, int]] = {}
         for event in self._recording:
             if event.kind is EventKind.LOG:
                 self._on_log(event)
-            if event.topic not in self._outputs or event.kind in (EventKind.LOSS, EventKind.LOG):
+            if event.topic not in self._outputs or event.kind not in _PUBLISHED:
                 continue
             if base is None:
-                base, beginning = event.epoch, event.version
-            if event.epoch == base and event.version < beginning + self._seek_ns:
+                base = event.epoch
+            if self._seek_ns and event.epoch == base and event.version < first:
                 continue
             epoch = offset + max(0, event.epoch - base)
             if not newest or epoch > self._epoch:

@@ -72,7 +72,7 @@ def test_under_loop_and_seek_too(street, tmp_path):
     summary = play_recording(
         street, profile="cpu", settings=settings, rate=None, seek=0.5, loops=2, record=tmp_path / "looped.mcap"
     )
-    assert summary.published[LIDAR_TOPIC] == 10  # from 0.45 s on: a camera is the first, 0.05 s before the sweep
+    assert summary.published[LIDAR_TOPIC] == 10  # a camera is the first, 0.05 s before the sweep: 0.45 s on it
     assert summary.recorded.dropped == summary.recorded.losses == {}
     epochs = [(event.epoch, event.topic) for event in Recording(tmp_path / "looped.mcap")]
     assert [epochs.count((epoch, OBSTACLES_TOPIC)) for epoch in (0, 1)] == [5, 5]
@@ -168,6 +168,14 @@ def test_topics_and_files_that_make_no_sense_are_refused(street, tmp_path):
         play_recording(street, record=street)
     with pytest.raises(SourceError, match="No such file"):
         list(replay_recording(tmp_path / "absent.mcap"))
+
+
+@pytest.mark.parametrize(("seek", "sweeps"), [(0.0, 10), (0.05, 10), (0.06, 9), (0.5, 5), (0.95, 1)])
+def test_a_seek_is_the_same_time_whichever_topics_are_played(street, seek, sweeps):
+    """The recording begins with a camera, 0.05 s before the first sweep, and ends 0.95 s later."""
+    everything = play_recording(street, rate=None, seek=seek)
+    alone = play_recording(street, rate=None, seek=seek, topics=[LIDAR_TOPIC])
+    assert everything.published[LIDAR_TOPIC] == alone.published[LIDAR_TOPIC] == sweeps
 
 
 def test_a_seek_beyond_the_end_is_told(street):

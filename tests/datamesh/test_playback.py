@@ -93,6 +93,63 @@ def test_seeking_leaves_out_what_is_before(recording):
     assert told == FIRST[8:] + SECOND
 
 
+@pytest.fixture(scope="module")
+def two_sensors(tmp_path_factory):
+    """Ten sweeps at 1 s, 1.1 s …, each with an image 50 ms before it that is committed after it."""
+    path = tmp_path_factory.mktemp("recording") / "two.mcap"
+    mesh = DataMesh()
+    with Recorder(path) as recorder:
+        recorder.watch(mesh, ["sweep", "image"])
+        for number in range(10):
+            commit(mesh, "sweep", 1_000_000_000 + number * 100_000_000, number)
+            commit(mesh, "image", 950_000_000 + number * 100_000_000, number)
+    return Recording(path)
+
+
+@pytest.mark.parametrize("loops", [1, 2])
+@pytest.mark.parametrize(
+    ("seek", "sweeps", "images"),
+    [
+        (0.0, range(10), range(10)),
+        (0.05, range(10), range(1, 10)),
+        (0.1, range(1, 10), range(1, 10)),
+        (0.5, range(5, 10), range(5, 10)),
+        (0.93, range(9, 10), ()),
+        (0.96, (), ()),
+    ],
+)
+def test_seeking_counts_from_the_lowest_version_of_all_topics_in_every_loop(two_sensors, loops, seek, sweeps, images):
+    mesh = DataMesh()
+    told = watch(mesh, "sweep", "image")
+    Player(two_sensors, mesh, ["sweep", "image"], rate=None, seek=seek, loops=loops).play()
+    assert [value for topic, value in told if topic == "sweep"] == [*sweeps] * loops
+    assert [value for topic, value in told if topic == "image"] == [*images] * loops
+
+
+def test_seeking_may_count_from_a_version_that_is_given(two_sensors):
+    """So that the same time is meant whichever topics are played."""
+    mesh = DataMesh()
+    told = watch(mesh, "sweep")
+    Player(two_sensors, mesh, ["sweep"], rate=None, seek=0.11, beginning=950_000_000).play()
+    assert told == [("sweep", number) for number in range(1, 10)]
+    again = watch(other := DataMesh(), "sweep")
+    Player(two_sensors, other, ["sweep"], rate=None, seek=0.11).play()
+    assert again == [("sweep", number) for number in range(2, 10)]
+
+
+@pytest.mark.parametrize("rate", [2.0, 8.0])
+def test_after_seeking_the_rate_counts_from_what_comes_first(two_sensors, rate):
+    """What was left out takes no time; what comes then is never earlier than the rate says."""
+    mesh = DataMesh()
+    stamps = []
+    mesh.window("sweep").subscribe(lambda entry: stamps.append((entry.version, time.perf_counter())), lambda *_: None)
+    Player(two_sensors, mesh, ["sweep"], rate=rate, seek=0.7).play()
+    (first, start), *rest = stamps
+    assert first == 1_700_000_000
+    for version, stamp in rest:
+        assert stamp - start >= (version - first) / 1e9 / rate - 0.005
+
+
 @pytest.mark.parametrize("rate", [1.0, 4.0])
 def test_versions_are_as_far_apart_as_the_rate_says(recording, rate):
     """Never earlier than the rate says; how much later is the machine's business."""
