@@ -150,7 +150,10 @@ class DataProcessComponent(Component):
         self._inline = self._runs_later = False
         self._thread: threading.Thread | None = None
         self._serving = threading.Lock()
-        self._running: Trigger | None = None
+        self.running: Trigger | None = None
+        """What it runs for now."""
+        self.after_run: Callable[[Trigger], None] | None = None
+        """Is told of each run that is over, before its version is settled."""
 
     @property
     def trigger_input(self) -> str | None:
@@ -159,7 +162,7 @@ class DataProcessComponent(Component):
 
     def at_work(self) -> dict[str, int]:
         """The parts that are at work now, and the versions that they are at work on."""
-        running = self._running
+        running = self.running
         return {} if running is None else {"process": running.version}
 
     def process(self, trigger: Trigger) -> Status:
@@ -274,7 +277,7 @@ class DataProcessComponent(Component):
                 self._serving.release()
 
     def _is_busy(self) -> bool:
-        return self._running is not None or bool(self.backlog and self.backlog.waiting)
+        return self.running is not None or bool(self.backlog and self.backlog.waiting)
 
     def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
         """Says on every output that was not committed at `version` that there will be nothing."""
@@ -287,8 +290,8 @@ class DataProcessComponent(Component):
         Raises:
             RuntimeError: What ran at the last stop still hangs.
         """
-        if self._running is not None:
-            raise RuntimeError(f"{self.name} cannot start again: it hangs at version {self._running.version}")
+        if self.running is not None:
+            raise RuntimeError(f"{self.name} cannot start again: it hangs at version {self.running.version}")
         for handle in self.inputs.values():
             handle.allow_waits()
         if self.backlog is not None:
@@ -323,7 +326,7 @@ class DataProcessComponent(Component):
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join(self.stop_timeout_s)
-        running = self._running
+        running = self.running
         if running is not None:
             self._hangs({"process": running.version})
             self._drop_waiting()
@@ -349,7 +352,7 @@ class DataProcessComponent(Component):
         if trigger.settled:
             self.settle(trigger.version, trigger.epoch)
             return
-        self._running = trigger
+        self.running = trigger
         for handle in self.outputs.values():
             handle.epoch = trigger.epoch
         for name in self.trigger_inputs:
@@ -359,8 +362,10 @@ class DataProcessComponent(Component):
         except BaseException:  # also SystemExit: only the process as a whole may end the thread
             self.log.exception("%s failed at version %d", self.name, trigger.version)
             self.losses.count(self.name, "failed", trigger.version)
+        if self.after_run is not None:
+            self.after_run(trigger)
         self.settle(trigger.version, trigger.epoch)
-        self._running = None
+        self.running = None
         self.has_run = True
 
 

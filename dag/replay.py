@@ -138,7 +138,7 @@ class Replay:
             mesh.window(topic).subscribe(lambda entry: self._fed.add((entry.epoch, entry.version)), lambda *_: None)
         drain = Drain(self._process, self._sources)
         if self._runs:
-            self._runs.apply(self._process)
+            self._runs.apply(self._process, {*self._sources, *produced_topics(self._process)})
         player = Player(
             self._recording,
             mesh,

@@ -1,15 +1,15 @@
 """The log of a run: what the clock decided in it, so that a replay need not ask a clock.
 
 Which triggers each component took, with the versions that triggered (what a backlog dropped is not among them); what
-weak and strong sync read, and so which waits ended without data; and which vertices a deadline left out. All of it is
-in a recording beside the data.
+weak and strong sync read, and so which waits ended without data; what data processes read; and which vertices a
+deadline left out. All of it is in a recording beside the data.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from ..datamesh.recording import READS, RUNS, RecordedEvent
 from .component import DagComponent, DataProcessComponent
 from .engine import VertexTiming
 from .process import Process
+from .recorded_accesses import Access, LoggedAccesses, ReplayedAccesses, decode_access
 from .recorded_reads import Awaited, Read, RecordedReads
 from .trigger import Trigger
 
@@ -41,9 +42,14 @@ class RunLog:
         for component in process.components.values():
             if isinstance(component, DataProcessComponent) and component.backlog is not None:
                 component.backlog.on_taken = partial(self._on_taken, component.name)
+                if not isinstance(component, DagComponent):
+                    LoggedAccesses(component, partial(self._on_accesses, component.name))
 
     def _on_taken(self, component: str, trigger: Trigger) -> None:
         self._log(RUNS, trigger.epoch, trigger.version, (component, dict(trigger.inputs)))
+
+    def _on_accesses(self, component: str, trigger: Trigger, accesses: Sequence[tuple]) -> None:
+        self._log(READS, trigger.epoch, trigger.version, (component, list(accesses)))
 
     def on_timing(self, timing: VertexTiming) -> None:
         """Logs what a vertex read, and that it was left out."""
@@ -76,6 +82,8 @@ class RecordedRuns:
         self._taken: dict[str, _Taken] = defaultdict(_Taken)
         self._reads: dict[str, dict[_Order, Mapping[str, Read] | None]] = defaultdict(dict)
         """Vertex → epoch and version of the frame → what it read, by input; None where it was left out."""
+        self._accesses: dict[str, dict[_Order, list[Access]]] = defaultdict(dict)
+        """Data process → epoch and version of the trigger → what it read, in its order."""
 
     def add(self, event: RecordedEvent, first: int) -> None:
         """Takes up an entry.
@@ -95,14 +103,21 @@ class RecordedRuns:
             self._taken[place].runs.append((*order, what))
         elif what is None:
             self._reads[place][order] = None
+        elif isinstance(what, list):
+            self._accesses[place][order] = [decode_access(noted, first) for noted in what]
         else:
             self._reads[place][order] = {name: _read(read, first) for name, read in what.items()}
 
     def __bool__(self) -> bool:
         return bool(self._taken)
 
-    def apply(self, process: Process) -> None:
-        """Makes a process that has not started take the triggers of the log, and read what it says."""
+    def apply(self, process: Process, topics: Container[str]) -> None:
+        """Makes a process that has not started take the triggers of the log, and read what it says.
+
+        Args:
+            process: The components.
+            topics: Those that the replay has: played, or committed by the components.
+        """
         awaited = Awaited()
         for component in process.components.values():
             taken = self._taken.get(component.name)
@@ -114,6 +129,8 @@ class RecordedRuns:
             for name in component.trigger_inputs:
                 on_commit, on_settle = partial(self._on_commit, component, name), partial(self._on_settle, component)
                 component.inputs[name].window.subscribe(on_commit, on_settle)
+            if not isinstance(component, DagComponent):
+                ReplayedAccesses(component, self._accesses[component.name], awaited, topics)
         for component in process.components.values():
             for vertex in component.vertices if isinstance(component, DagComponent) else ():
                 place = f"{component.name}.{vertex.name}"

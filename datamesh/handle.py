@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from types import TracebackType
-from typing import Any, Generic, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Generic, Protocol, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from .status import Outcome, Status
 from .waiting import Waiting
 from .window import Window
 
-__all__ = ["Accessor", "Change", "Input", "Output", "declared_handles"]
+__all__ = ["Accessor", "Change", "Input", "Output", "Reads", "declared_handles"]
 
 T = TypeVar("T")
 P = TypeVar("P")
@@ -41,16 +41,23 @@ class Accessor(Generic[T]):
     with handle.access() as snapshot: …
     """
 
-    __slots__ = ("_epoch", "_snapshot", "_stream", "_window")
+    __slots__ = ("_epoch", "_snapshot", "_stream", "_take", "_window")
 
-    def __init__(self, window: Window[T], epoch: int = CURRENT_EPOCH, stream: Any = None) -> None:
+    def __init__(
+        self,
+        window: Window[T],
+        epoch: int = CURRENT_EPOCH,
+        stream: Any = None,
+        take: Callable[[int, Any], Snapshot[T]] | None = None,
+    ) -> None:
         self._window = window
         self._epoch = epoch
         self._stream = stream
+        self._take = take or window.snapshot
         self._snapshot: Snapshot[T] | None = None
 
     def __enter__(self) -> Snapshot[T]:
-        self._snapshot = self._window.snapshot(self._epoch, self._stream)
+        self._snapshot = self._take(self._epoch, self._stream)
         return self._snapshot
 
     def __exit__(self, *_: object) -> None:
@@ -213,11 +220,25 @@ class _Handle(Generic[T]):
         return self.window.topic
 
 
+class Reads(Protocol):
+    """What stands between an input and its window in a run that is recorded or replayed."""
+
+    def snapshot(self, handle: Input, epoch: int, stream: Any) -> Snapshot:
+        """Gives a snapshot that the component asks for."""
+        ...
+
+    def wait(self, handle: Input, version: int, epoch: int, wait: Callable[[], Waiting]) -> Waiting:
+        """Ends a wait that the component's thread begins; `wait` does it at the window."""
+        ...
+
+
 class Input(_Handle[T]):
     """Reads a topic."""
 
     def __init__(self, *, optional: bool = False) -> None:
         super().__init__(optional=optional)
+        self.reads: Reads | None = None
+        """What its reads go through; None: they go to the window."""
         self._waits: set[Waiting[T]] | None = set()
         self._lock = threading.Lock()
 
@@ -229,7 +250,8 @@ class Input(_Handle[T]):
             stream: Where the values will be read; None is on the host. Values that a device is still writing are
                 waited for accordingly.
         """
-        return Accessor(self.window, self.epoch if epoch is None else epoch, stream)
+        take = None if self.reads is None else partial(self.reads.snapshot, self)
+        return Accessor(self.window, self.epoch if epoch is None else epoch, stream, take)
 
     def wait(
         self, version: int, timeout_ns: int | None = None, *, tolerance_ns: int = 0, epoch: int | None = None
@@ -242,11 +264,16 @@ class Input(_Handle[T]):
             tolerance_ns: How far from it the version may be; the nearest of those there is taken [ns].
             epoch: Of the version; by default as for `access`.
         """
-        ended = threading.Event()
-        due = None if timeout_ns is None else self.window.clock.monotonic_ns() + timeout_ns
-        waiting = self.when(version, lambda _: ended.set(), due_ns=due, tolerance_ns=tolerance_ns, epoch=epoch)
-        ended.wait()
-        return waiting
+        epoch = self.epoch if epoch is None else epoch
+
+        def wait() -> Waiting[T]:
+            ended = threading.Event()
+            due = None if timeout_ns is None else self.window.clock.monotonic_ns() + timeout_ns
+            waiting = self.when(version, lambda _: ended.set(), due_ns=due, tolerance_ns=tolerance_ns, epoch=epoch)
+            ended.wait()
+            return waiting
+
+        return wait() if self.reads is None else self.reads.wait(self, version, epoch, wait)
 
     def when(
         self,

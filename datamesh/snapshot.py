@@ -107,6 +107,11 @@ class Snapshot(Generic[T]):
         self._stream = stream
 
     @property
+    def state(self) -> State[T]:
+        """The state of the window that it shows."""
+        return self._state
+
+    @property
     def epoch(self) -> int:
         """Rises when the clock steps, a recording loops or seeks, or the producer restarts."""
         return self._state.epoch
