@@ -283,18 +283,24 @@ def _nuscenes(outcomes: list[FrameOutcome]) -> dict[str, Any]:
 
 
 def _bev(outcomes: list[FrameOutcome]) -> dict[str, Any]:
-    """AP by overlap from above: objects with 10 points within 60 m, the others neither right nor wrong to find."""
-    frames = [
-        DetectionFrame(
-            boxes=each.found.boxes,
-            scores=each.found.scores,
-            classes=each.found.classes,
-            truth=each.frame.boxes.astype(np.float32),
-            truth_classes=each.frame.classes,
-            ignore=(each.frame.counts < _BEV_POINTS) | (np.hypot(*each.frame.boxes[:, :2].T) >= _BEV_RANGE),
+    """AP by overlap from above: objects with 10 points within 60 m, the others neither right nor wrong to find.
+
+    Detections beyond that range are left out, as are the true objects there, and as nuScenes' kit does with both.
+    """
+    frames = []
+    for each in outcomes:
+        found = each.found.select(np.hypot(each.found.boxes[:, 0], each.found.boxes[:, 1]) < _BEV_RANGE)
+        far = np.hypot(each.frame.boxes[:, 0], each.frame.boxes[:, 1]) >= _BEV_RANGE
+        frames.append(
+            DetectionFrame(
+                boxes=found.boxes,
+                scores=found.scores,
+                classes=found.classes,
+                truth=each.frame.boxes.astype(np.float32),
+                truth_classes=each.frame.classes,
+                ignore=(each.frame.counts < _BEV_POINTS) | far,
+            )
         )
-        for each in outcomes
-    ]
     result = {}
     for index, overlap in _BEV_OVERLAPS.items():
         curve = evaluate_class(frames, index, measure="bev", threshold=overlap)

@@ -327,6 +327,28 @@ def grow(street: Street, plan: StreetPlan, density: float) -> None:
     _overgrow(street, plan)
 
 
+def clutter(street: Street, plan: StreetPlan) -> None:
+    """Adds what a head that had not seen it took for a car or missed: columns, gates, dense shrubs, cars of 3 m.
+
+    Args:
+        street: As furnished and grown so far; some of its small parked cars become smaller.
+        plan: Its measures.
+    """
+    random, add, things = street.random, street.add, street.things
+    low, high = plan.extent
+    line = plan.half_width + plan.sidewalk
+    for kind, most in (("column", 7), ("gate", 5), ("topiary", 18)):
+        for _ in range(random.integers(0, most)):
+            s, side = random.uniform(low, high), random.choice([-1, 1])
+            near = plan.half_width + random.uniform(0.9, max(1.0, plan.sidewalk - 0.3))
+            d = near if kind == "column" and random.random() < 0.5 else line + random.gamma(1.1, 2.5)
+            if plan.open_at(s, plan.sidewalk + 2.0):
+                add(kind, s, side * d, random.choice([0.0, 0.5 * np.pi]) + random.normal(0, 0.15), margin=0.0)
+    for k in range(len(things)):
+        if things.kind[k] in ("mini", "hatch", "coupe") and random.random() < 0.2:
+            things.kind[k] = "micro"
+
+
 def _overgrow(street: Street, plan: StreetPlan) -> None:
     """Lets a plant touch some of the vehicles that stand beside the street or at its edge."""
     random, things = street.random, street.things

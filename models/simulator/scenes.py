@@ -12,7 +12,7 @@ from ...kernels.device import resolve_device
 from ...kernels.raycast import LidarCast
 from .ego import mounting
 from .frame import SimulatedFrame
-from .furnishing import furnish, grow, populate
+from .furnishing import clutter, furnish, grow, populate
 from .library import Library
 from .sensors import LIDARS, Lidar, lidar_model
 from .street import STYLES, Street, random_street
@@ -67,6 +67,7 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
     speed = random.uniform(0.0, 14.0) if turning and random.random() < 0.8 else 0.0
     # Last, so that it changes nothing else of the scenes.
     grow(street, plan, random.uniform(0.1, 1.5 if style != "urban" else 0.7))
+    clutter(street, plan)
 
     def pose_at(t: float) -> np.ndarray:
         one = np.ones(1)

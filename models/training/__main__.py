@@ -22,6 +22,7 @@ def main(
     frames: Annotated[int, typer.Option(help="Simulated scans to learn from.")] = 2000,
     views: Annotated[int, typer.Option(help="Scans of each simulated street: more cost less time a scan.")] = 1,
     stem: Annotated[int, typer.Option(help="Channels of the network at 0.5 m.")] = 24,
+    blocks: Annotated[int, typer.Option(help="Residual blocks of the network at 2 m.")] = 1,
     lean: Annotated[bool, typer.Option("--lean", help="Look at 16 of the 20 pillar channels.")] = False,
     extra: Annotated[
         list[str] | None, typer.Option(help="Also learn iou, vx or vy; vx and vy are not exported.")
@@ -51,6 +52,7 @@ def main(
         frames=frames,
         views=views,
         width=(stem, 48, 128),
+        depth=(1, blocks),
         channels=LEAN_CHANNELS if lean else pillar_channels(),
         extras=tuple(extra or ()),
         frames_folder=frames_folder,

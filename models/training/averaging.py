@@ -46,6 +46,7 @@ def main(
     checkpoints: Annotated[list[Path], typer.Argument(help="checkpoint.pt of each training.")],
     out: Annotated[Path, typer.Option(help="Folder for the head's ONNX and YAML.")],
     stem: Annotated[int, typer.Option(help="As in training.")] = 24,
+    blocks: Annotated[int, typer.Option(help="As in training.")] = 1,
     lean: Annotated[bool, typer.Option("--lean", help="As in training.")] = False,
     extra: Annotated[list[str] | None, typer.Option(help="As in training.")] = None,
     score: Annotated[float, typer.Option(help="The threshold that the card recommends.")] = 0.3,
@@ -57,7 +58,7 @@ def main(
     from .network import LEAN_CHANNELS
 
     network = PillarCenterNet(
-        (stem, 48, 128), channels=LEAN_CHANNELS if lean else pillar_channels(), extras=tuple(extra or ())
+        (stem, 48, 128), (1, blocks), LEAN_CHANNELS if lean else pillar_channels(), tuple(extra or ())
     )
     card = export_head(
         average_networks(checkpoints, network),

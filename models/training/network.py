@@ -121,7 +121,7 @@ class PillarCenterNet(nn.Module):
 
         Where shapes differ, the common part is copied; what is new among a layer's inputs begins at zero for the
         outputs that were there, so that these say at first what they did (Net2Net, Chen et al., ICLR 2016), and new
-        outputs begin at random.
+        outputs begin at random. A residual block that is new begins as nothing but its shortcut.
 
         Args:
             state: Its `state_dict`.
@@ -130,6 +130,8 @@ class PillarCenterNet(nn.Module):
         every = pillar_channels()
         for name, mine in own.items():
             if name not in state:
+                if name.endswith("second.1.weight"):
+                    mine.zero_()
                 continue
             given = state[name]
             if name == "stem.0.weight" and given.shape[1] == len(every) and len(self.channels) < len(every):

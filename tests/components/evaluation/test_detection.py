@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from warploom.cli import app
 from warploom.components.evaluation.detection import evaluate_detection, write_summary
 from warploom.components.evaluation.detection_figures import figures_of
-from warploom.components.evaluation.detection_frames import evaluation_frames
+from warploom.components.evaluation.detection_frames import EvaluationFrame, evaluation_frames
 from warploom.components.evaluation.detection_outcomes import judge
 from warploom.components.evaluation.detection_report import write_report
 from warploom.components.evaluation.detection_reviews import Review
@@ -217,3 +217,27 @@ def test_where_a_range_image_has_no_labels_nothing_is_false(tmp_path):
     figures = figures_of("range", [outcome], 0.5, (), None)["at"]["0.5"]
     assert (figures["false_vehicles_per_frame"], figures["and_without_labels"]) == (1.0, 1.0)
     assert figures["car_points_in_boxes"] == 1.0
+
+
+def test_what_is_found_beyond_the_range_is_neither_right_nor_wrong(tmp_path):
+    """AP from above within 60 m: a box out there is left out, a wrong one within it is not."""
+    boxes = np.array([[x, 0, 0, 4, 2, 2, 0] for x in (10.0, 70.0)], np.float64)
+    frame = EvaluationFrame(
+        name="one", kind="sim", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
+        classes=np.zeros(2, np.int32), types=("object",) * 2, counts=np.full(2, 50), velocities=np.zeros((2, 2)),
+    )  # fmt: skip
+
+    def average(*places):
+        found = Detections(
+            boxes=np.array([[x, 0, 0, 4, 2, 2, 0] for x in places], np.float32),
+            scores=np.linspace(0.9, 0.5, len(places), dtype=np.float32),
+            classes=np.zeros(len(places), np.int32),
+            velocities=np.full((len(places), 2), np.nan, np.float32),
+            background=np.zeros(len(places), bool),
+        )
+        figures = figures_of("sim", [judge(frame, found, 0.0, 0.4, None)], 0.4, (), None)["bev_ap"]["vehicle"]
+        return figures["ap"], figures["objects"]
+
+    assert average(10.0) == (100.0, 1)
+    assert average(73.0, 10.0) == (100.0, 1)
+    assert average(30.0, 10.0) == (50.0, 1)

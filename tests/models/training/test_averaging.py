@@ -8,9 +8,9 @@ from warploom.models.training.averaging import average_networks, main
 from warploom.models.training.network import PillarCenterNet
 
 
-def checkpoint(path, seed, width):
+def checkpoint(path, seed, width, depth=(1, 1)):
     torch.manual_seed(seed)
-    network = PillarCenterNet(width)
+    network = PillarCenterNet(width, depth)
     network.train()(torch.rand(2, 20, 16, 16))
     averaged = torch.optim.swa_utils.AveragedModel(network, use_buffers=True)
     path.parent.mkdir()
@@ -31,8 +31,8 @@ def test_every_weight_is_the_mean(tmp_path):
 
 
 def test_the_command_writes_a_head(tmp_path):
-    checkpoint(tmp_path / "a" / "checkpoint.pt", 0, (16, 48, 128))
-    main([tmp_path / "a" / "checkpoint.pt"], tmp_path / "head", stem=16, score=0.4)
+    checkpoint(tmp_path / "a" / "checkpoint.pt", 0, (16, 48, 128), (1, 2))
+    main([tmp_path / "a" / "checkpoint.pt"], tmp_path / "head", stem=16, blocks=2, score=0.4)
     card, _ = load_card(tmp_path / "head" / "pillar_center.yaml")
     assert card.decode.score_threshold == 0.4
     assert card.training == {"mean_of": ["a"]}

@@ -173,6 +173,17 @@ def test_a_wider_network_begins_where_a_narrower_one_was():
         torch.testing.assert_close(new.eval()(kept), old.eval()(pillars), atol=1e-5, rtol=1e-5)
 
 
+def test_a_deeper_network_begins_as_the_shallower_one():
+    torch.manual_seed(4)
+    shallow = PillarCenterNet((8, 8, 8), (1, 1)).eval()
+    deep = PillarCenterNet((8, 8, 8), (1, 3)).eval()
+    deep.begin_with(shallow.state_dict())
+    pillars = torch.rand(1, 20, 32, 32)
+    torch.testing.assert_close(deep(pillars), shallow(pillars))
+    deep.train()(pillars).sum().backward()
+    assert deep.down2[-1].second[1].weight.grad.abs().sum() > 0  # from there on it learns
+
+
 def test_names_that_there_are_not_are_refused():
     for options, message in (
         ({"channels": ("z9",)}, "channels must be of"),
@@ -309,6 +320,27 @@ def test_saying_the_targets_costs_next_to_nothing():
     assert right.shape[1] == len(HEAD_CLASSES) + len(REGRESSION)
     assert float(loss(right, heat, mask, values, weight)[0]) < 1e-3
     assert float(loss(wrong, heat, mask, values, weight)[0]) > 10.0
+
+
+def test_what_a_place_is_off_by_costs_a_person_more_than_a_bus():
+    """0.3 m along an object's axis of either size: L1 is the same, the overlap is not; gradients stay finite."""
+    costs, pulls = [], []
+    for size in ([0.7, 0.6, 1.75], [11.0, 2.5, 3.0]):
+        box = np.array([[1.25, -0.75, 0.5 * size[2], *size, 0.0]], np.float32)
+        t = draw_targets(box, np.array([0]), np.array([50]), (-8.0, -8.0), 0.5, (32, 32))
+        heat, mask, values, weight = (torch.from_numpy(a)[None] for a in (t.heat, t.mask, t.values, t.weight))
+        said = torch.cat([torch.where(heat >= 1.0, 12.0, -12.0), values], dim=1)
+        said[:, len(HEAD_CLASSES)] += 0.6  # [cells]
+        said.requires_grad_()
+        total, parts = loss(said, heat, mask, values, weight)
+        total.backward()
+        assert torch.isfinite(said.grad).all()
+        costs.append(parts)
+        pulls.append(float(said.grad[0, len(HEAD_CLASSES)].abs().sum()))
+    assert costs[0]["box"] == pytest.approx(costs[1]["box"], abs=1e-5)
+    assert costs[0]["apart"] == pytest.approx(1 - 0.4 / 1.0, abs=1e-4)
+    assert costs[1]["apart"] == pytest.approx(1 - 10.7 / 11.3, abs=1e-4)
+    assert pulls[0] > 2 * pulls[1]
 
 
 def test_contradicting_lengths_are_refused(tmp_path):
