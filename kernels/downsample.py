@@ -1,7 +1,7 @@
 """Voxel downsampling: one point per occupied voxel, the centroid of the points in it, the first, or a random one.
 
 Centroids are summed in fixed point, so the result does not depend on the order in which threads run: the same bytes
-on every run, on a CPU and on a GPU. A CPU adds the points to their voxels in order; a GPU shares a hash table.
+on every run, on a CPU and on a GPU. A CPU adds runs of points to their voxels in order; a GPU shares a hash table.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["VoxelDownsample", "voxel_downsample"]
 # Which voxel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
+_LEAST_PART = 500_000  # points; fewer take less time than parts that have to find their own
 _FARTHEST = 2.0**20  # [m]; float32 has steps of 6 cm there
 _LARGEST_CELL = 2.0**30
 _SPREAD = wp.constant(wp.uint32(0x9E3779B1))

@@ -1,10 +1,13 @@
-"""The points of each voxel summed by the threads of a CPU, each with a hash table and voxels of its own.
+"""The points of each voxel summed on a CPU: by one thread at once, or by a few, each with voxels of its own.
 
-First each point's cell and slot, in parts by points. The slot says whose the point is: blocks of 8 × 8 × 1 cells are
-dealt to the parts. Each part then goes through its points in order; and last its voxels are numbered, together with the
-others', by their first points, since each part has its own in that order.
+Points one after the other in a scan are mostly in one voxel. So these runs are found first, a block of points at a time
+and without a branch: the cell of each, and the sums of all points before it, from which its own follow. A hash table
+then leads to the voxel of each run; most are of a voxel that is not there yet.
 
-A voxel is one row, one cache line, of 64-bit numbers: cell x and y, cell z and slot, points, sums of x y z.
+Several threads find the runs in parts by points; then each goes through all of them in order, and adds those that are
+its own to their voxels: the slot where its hash table has a voxel first says whose that is, as blocks of 8 × 8 × 1
+cells are dealt to the parts. Last the voxels are numbered, together with the others', by their first points, since each
+part has its own in that order.
 """
 
 from __future__ import annotations
@@ -12,54 +15,214 @@ from __future__ import annotations
 import warp as wp
 
 from .parts import packed_parts, part_start
+from .point_lanes import LOAD_POINTS
 
 __all__ = ["VoxelSums"]
 
 # Which voxel a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
+_RUN_WORDS, _ROW_WORDS = 6, 6  # of 64 bits
 
-@wp.func_native("""
-    const auto run = [&](const float* __restrict points, const long long step, int* __restrict cells,
-                         int* __restrict slots) {
-        for (long long i = first; i < last; ++i) {
-            const float x = points[i * step], y = points[i * step + 1], z = points[i * step + 2];
+# What a run and a voxel are in memory. A run's points end, and its sums are complete, where the one after it begins.
+_RECORDS = """
+    struct Run {
+        long long before[4];  // sums along x y z of all points of the part before the run, and how many these are
+        int cell[3], slot;
+    };
+    struct Row {
+        long long sum[4];
+        int cell[3], slot;
+    };
+"""
+
+
+# C++ for what follows: `add_runs(start, length, run)` puts the runs of a block of points after `run`, the last of those
+# before, and gives the last; the one after that is where it ends.
+_FIND = (
+    LOAD_POINTS
+    + """
+    constexpr int BLOCK = 128;
+    const float* points = (const float*)xyz_in.data;
+    const long long step = xyz_in.strides[0] / 4;
+    float along[3][BLOCK];
+    int cell[3][BLOCK + 1], slot[BLOCK + 1];  // the first is of the point before the block
+    int cell_and_slot[BLOCK][4], is_new[BLOCK];
+    long long fixed_and_one[BLOCK][4], before[4] = {0, 0, 0, 0};
+    for (int axis = 0; axis < 3; ++axis) cell[axis][0] = 0;
+    slot[0] = -2;  // as no point's
+    const auto add_runs = [&](const int start, const int length, Run* run) {
+        load_points(points + step * start, step, length, along);
+        for (int k = 0; k < length; ++k) {
+            float x = along[0][k], y = along[1][k], z = along[2][k];
             // All comparisons are false for a NaN.
             const bool usable = (x < limit) & (x > -limit) & (y < limit) & (y > -limit) & (z < limit) & (z > -limit);
-            const float u = usable ? x * inverse_size : 0.0f, v = usable ? y * inverse_size : 0.0f;
-            const float w = usable ? z * inverse_size : 0.0f;
+            along[0][k] = x = usable ? x : 0.0f;
+            along[1][k] = y = usable ? y : 0.0f;
+            along[2][k] = z = usable ? z : 0.0f;
+            const float u = x * inverse_size, v = y * inverse_size, w = z * inverse_size;
             const int a = (int)u, b = (int)v, c = (int)w;
             const int cell_x = a - ((float)a > u), cell_y = b - ((float)b > v), cell_z = c - ((float)c > w);
             const unsigned block = (unsigned)(cell_x >> 3) * 73856093u ^ (unsigned)(cell_y >> 3) * 19349669u
                 ^ (unsigned)cell_z * 83492791u;
             const unsigned within = (unsigned)((cell_x & 7) << 3 | (cell_y & 7));
-            const unsigned slot = ((block * 0x9E3779B1u >> 8) << 6 | within) & mask;
-            cells[3 * i] = cell_x;
-            cells[3 * i + 1] = cell_y;
-            cells[3 * i + 2] = cell_z;
-            slots[i] = usable ? (int)slot : -1;
+            cell[0][k + 1] = cell_x;
+            cell[1][k + 1] = cell_y;
+            cell[2][k + 1] = cell_z;
+            slot[k + 1] = usable ? (int)(((block * 0x9E3779B1u >> 8) << 6 | within) & (unsigned)(slots - 1)) : -1;
+        }
+        for (int k = 0; k < length; ++k)
+            is_new[k] = ((slot[k] ^ slot[k + 1]) | (cell[0][k] ^ cell[0][k + 1]) | (cell[1][k] ^ cell[1][k + 1])
+                | (cell[2][k] ^ cell[2][k + 1])) != 0;
+        for (int k = 0; k < length; ++k) {
+            for (int axis = 0; axis < 3; ++axis) {
+                cell_and_slot[k][axis] = cell[axis][k + 1];
+                fixed_and_one[k][axis] = (long long)(along[axis][k] * scale);
+            }
+            cell_and_slot[k][3] = slot[k + 1];
+            fixed_and_one[k][3] = 1;
+        }
+        for (int k = 0; k < length; ++k) {
+            run += is_new[k];
+            memcpy(run->cell, cell_and_slot[k], sizeof(cell_and_slot[k]));
+            for (int n = 0; n < 4; ++n) before[n] += fixed_and_one[k][n];
+            memcpy(run[1].before, before, sizeof(before));
+        }
+        for (int axis = 0; axis < 3; ++axis) cell[axis][0] = cell[axis][length];
+        slot[0] = slot[length];
+        return run;
+    };
+"""
+)
+
+# `sum_run(run, end)` adds a run to its voxel, or makes that; `end` is the run after it.
+_SUM = """
+    const int slots = table.shape[1];
+    int* __restrict voxel_in = table.data + (long long)slots * part;
+    Row* __restrict row = (Row*)rows.data + rows.shape[1] * part;
+    int* __restrict first_of_row = first_out.data + rows.shape[1] * part;
+    int voxels = 0;
+    const auto fetch = [&](const Run& run) {
+    #ifndef __CUDA_ARCH__
+        __builtin_prefetch(voxel_in + (run.slot < 0 ? 0 : run.slot), 1);
+    #endif
+    };
+    const auto sum_run = [&](const Run& run, const Run& end, const int first_point) {
+        int slot = run.slot, found = voxel_in[slot];
+        while (found >= 0 && ((row[found].cell[0] ^ run.cell[0]) | (row[found].cell[1] ^ run.cell[1])
+                | (row[found].cell[2] ^ run.cell[2])) != 0) {
+            slot = (slot + 65) & (slots - 1);  // in the next block, since the neighbours in this one have their own
+            found = voxel_in[slot];
+        }
+        if (found < 0) {
+            for (int n = 0; n < 4; ++n) row[voxels].sum[n] = end.before[n] - run.before[n];
+            memcpy(row[voxels].cell, run.cell, sizeof(run.cell));
+            row[voxels].slot = slot;
+            first_of_row[voxels] = first_point + (int)run.before[3];
+            voxel_in[slot] = voxels++;
+        } else
+            for (int n = 0; n < 4; ++n) row[found].sum[n] += end.before[n] - run.before[n];
+    };
+"""
+
+
+@wp.func_native(
+    _RECORDS
+    + _SUM
+    + _FIND
+    + """
+    Run runs[BLOCK + 2];
+    memcpy(runs[0].before, before, sizeof(before));
+    memcpy(runs[1].before, before, sizeof(before));
+    runs[0].slot = -1;  // as if an unusable run of no points came first
+    Run* last = runs;
+    long long unusable = 0;
+    const auto sum = [&](const int length) {
+        for (int r = 0; r < length; ++r) {
+            if (runs[r].slot >= 0) sum_run(runs[r], runs[r + 1], 0);
+            else unusable += runs[r + 1].before[3] - runs[r].before[3];
         }
     };
-    const float* points = (const float*)xyz_in.data;
-    if (xyz_in.strides[0] == 16) run(points, 4, (int*)cells_out.data, slots_out.data);
-    else if (xyz_in.strides[0] == 12) run(points, 3, (int*)cells_out.data, slots_out.data);
-    else run(points, xyz_in.strides[0] / 4, (int*)cells_out.data, slots_out.data);
-""")
-def _find_cells(
+    for (int start = 0; start < points_in; start += BLOCK) {
+        last = add_runs(start, points_in - start < BLOCK ? points_in - start : BLOCK, last);
+        const int length = (int)(last - runs);
+        for (int r = 0; r <= length; ++r) fetch(runs[r]);
+        sum(length);
+        runs[0] = last[0];
+        memcpy(runs[1].before, before, sizeof(before));
+        last = runs;
+    }
+    if (points_in > 0) sum(1);
+    voxels_out.data[0] = voxels;
+    dropped_out.data[0] = (int)unusable;
+"""
+)
+def _sum_at_once(
+    part: int,
     xyz_in: wp.array(dtype=wp.vec3),
+    points_in: int,
     inverse_size: float,
     limit: float,
-    mask: int,
-    first: int,
-    last: int,
-    cells_out: wp.array(dtype=wp.vec3i),
-    slots_out: wp.array(dtype=wp.int32),
+    scale: float,
+    table: wp.array2d(dtype=wp.int32),
+    rows: wp.array3d(dtype=wp.int64),
+    first_out: wp.array2d(dtype=wp.int32),
+    voxels_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
 ):
-    """Of the points first … last − 1 the cell and its first slot; those of a block of cells lie side by side."""
+    """Adds the runs of one block of points after the other to their voxels."""
 
 
 @wp.kernel
-def _find_cells_of_part(
+def _sum_all(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    inverse_size: float,
+    limit: float,
+    scale: float,
+    # in out: a table of voxels, -1 where free
+    table: wp.array2d(dtype=wp.int32),
+    # out: the voxels, the first point of each, and how many there are
+    rows_out: wp.array3d(dtype=wp.int64),
+    first_out: wp.array2d(dtype=wp.int32),
+    voxels_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """All voxels, by one thread: no run leaves its cache."""
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    _sum_at_once(0, xyz_in, n, inverse_size, limit, scale, table, rows_out, first_out, voxels_out, dropped_out)
+
+
+@wp.func_native(
+    _RECORDS
+    + _FIND
+    + """
+    Run* const runs = (Run*)runs_out.data + first + part;  // each part has one more than points
+    memcpy(runs->before, before, sizeof(before));
+    Run* last = runs - 1;
+    for (int start = first; start < end; start += BLOCK)
+        last = add_runs(start, end - start < BLOCK ? end - start : BLOCK, last);
+    range_out.data[part] = wp::vec3i(first + part, first + part + (int)(last + 1 - runs), first);
+"""
+)
+def _find_runs(
+    part: int,
+    first: int,
+    end: int,
+    xyz_in: wp.array(dtype=wp.vec3),
+    inverse_size: float,
+    limit: float,
+    scale: float,
+    slots: int,
+    runs_out: wp.array2d(dtype=wp.int64),
+    range_out: wp.array(dtype=wp.vec3i),
+):
+    """The runs of the points first … end − 1; those of a block of cells have slots side by side."""
+
+
+@wp.kernel
+def _find_runs_of_part(
     # in
     part: int,
     parts: int,
@@ -67,91 +230,54 @@ def _find_cells_of_part(
     count_in: wp.array(dtype=wp.int32),
     inverse_size: float,
     limit: float,
+    scale: float,
     slots: int,
     # out
-    cells_out: wp.array(dtype=wp.vec3i),
-    slots_out: wp.array(dtype=wp.int32),
+    runs_out: wp.array2d(dtype=wp.int64),
+    range_out: wp.array(dtype=wp.vec3i),
 ):
-    """Of each point of a part its cell along x y z, and the slot where a hash table has it first, or −1."""
+    """The runs of each part; where these are, first and end, and which is the first point."""
     n = wp.min(count_in[0], xyz_in.shape[0])
     first = part_start(n, part, parts)
-    last = part_start(n, part + 1, parts)
-    _find_cells(xyz_in, inverse_size, limit, slots - 1, first, last, cells_out, slots_out)
+    end = part_start(n, part + 1, parts)
+    _find_runs(part, first, end, xyz_in, inverse_size, limit, scale, slots, runs_out, range_out)
 
 
-@wp.func_native("""
-    constexpr int XY = 0, Z_SLOT = 1, COUNT = 2, SUM = 3, ROW = 8, ROW_AHEAD = 12, SLOT_AHEAD = 24;
-    const long long step = xyz_in.strides[0] / 4, capacity = rows.shape[1];
-    const float* __restrict xyz = (const float*)xyz_in.data;
-    const int* __restrict cells = (const int*)cells_in.data;
-    const int* __restrict slot_of_point = slots_in.data;
-    const int slots = table.shape[1], mask = slots - 1;
-    int* __restrict voxel_in = table.data + (long long)slots * part;
-    long long* __restrict all_rows = rows.data + capacity * ROW * part;
-    int* __restrict first_of_voxel = first_out.data + capacity * part;
-    int* __restrict own = own_out.data + capacity * part;
-
+@wp.func_native(
+    _RECORDS
+    + _SUM
+    + """
+    constexpr int AHEAD = 16;
+    const Run* __restrict runs = (const Run*)runs_in.data;
     int block_bits = 0;
     while (64 << block_bits < slots) ++block_bits;
-    int owned = 0, unusable = 0;
-    for (int i = 0; i < points; ++i) {
-        const int slot = slot_of_point[i];
-        own[owned] = i;
-        owned += (slot >= 0) & ((int)((unsigned)(slot >> 6) * (unsigned)parts >> block_bits) == part);
-        unusable += slot < 0;
-    }
-
-    int voxels = 0;
-    for (int k = 0; k < owned; ++k) {
-    #ifndef __CUDA_ARCH__
-        // What is looked up soon is fetched by now, first the slot, then the row.
-        if (k + SLOT_AHEAD < owned) {
-            const int row = voxel_in[slot_of_point[own[k + ROW_AHEAD]]];
-            __builtin_prefetch(voxel_in + slot_of_point[own[k + SLOT_AHEAD]]);
-            __builtin_prefetch(all_rows + (long long)ROW * (row < 0 ? voxels : row), 1);
+    long long unusable = 0;
+    for (int p = 0; p < parts; ++p) {
+        const int end = ranges_in.data[p][1], first_point = ranges_in.data[p][2];
+        for (int r = ranges_in.data[p][0]; r < end; ++r) {
+            if (r + AHEAD < end) fetch(runs[r + AHEAD]);
+            const int slot = runs[r].slot;
+            if (slot < 0) unusable += runs[r + 1].before[3] - runs[r].before[3];
+            else if ((int)((unsigned)(slot >> 6) * (unsigned)parts >> block_bits) == part)
+                sum_run(runs[r], runs[r + 1], first_point);
         }
-    #endif
-        const int i = own[k];
-        int slot = slot_of_point[i], row = voxel_in[slot];
-        const long long xy = (long long)cells[3ll * i] << 32 | (unsigned)cells[3ll * i + 1], z = cells[3ll * i + 2];
-        long long* __restrict at = all_rows + (long long)ROW * (row < 0 ? 0 : row);
-        while ((row >= 0) & ((at[XY] != xy) | (at[Z_SLOT] >> 32 != z))) {
-            slot = (slot + 65) & mask;  // in the next block, since the neighbours in this one have slots of their own
-            row = voxel_in[slot];
-            at = all_rows + (long long)ROW * (row < 0 ? 0 : row);
-        }
-        const bool is_new = row < 0;  // no branch: there is no telling
-        const long long keep = is_new ? 0 : -1;
-        first_of_voxel[voxels] = i;
-        row = is_new ? voxels : row;
-        voxels += is_new;
-        voxel_in[slot] = row;
-        at = all_rows + (long long)ROW * row;
-        at[XY] = xy;
-        at[Z_SLOT] = z << 32 | slot;
-        at[COUNT] = (at[COUNT] & keep) + 1;
-        for (int axis = 0; axis < 3; ++axis)
-            at[SUM + axis] = (at[SUM + axis] & keep) + (long long)(xyz[step * i + axis] * scale);
     }
     voxels_out.data[part] = voxels;
-    if (part == 0) dropped_out.data[0] = unusable;
-""")
-def _sum_voxels(
+    if (part == 0) dropped_out.data[0] = (int)unusable;
+"""
+)
+def _sum_own(
     part: int,
     parts: int,
-    xyz_in: wp.array(dtype=wp.vec3),
-    points: int,
-    cells_in: wp.array(dtype=wp.vec3i),
-    slots_in: wp.array(dtype=wp.int32),
-    scale: float,
+    runs_in: wp.array2d(dtype=wp.int64),
+    ranges_in: wp.array(dtype=wp.vec3i),
     table: wp.array2d(dtype=wp.int32),
     rows: wp.array3d(dtype=wp.int64),
-    own_out: wp.array2d(dtype=wp.int32),
     first_out: wp.array2d(dtype=wp.int32),
     voxels_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
 ):
-    """Lists the points of a part, and adds each to its voxel."""
+    """Adds the runs of a part's blocks of cells to their voxels."""
 
 
 @wp.kernel
@@ -159,35 +285,31 @@ def _sum_part(
     # in
     part: int,
     parts: int,
-    xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    cells_in: wp.array(dtype=wp.vec3i),
-    slots_in: wp.array(dtype=wp.int32),
-    scale: float,
+    runs_in: wp.array2d(dtype=wp.int64),
+    ranges_in: wp.array(dtype=wp.vec3i),
     # in out: of each part a table of its voxels, -1 where free
     table: wp.array2d(dtype=wp.int32),
-    # out: of each part its voxels and points, the first point of each voxel, and how many voxels there are
+    # out: of each part its voxels, the first point of each, and how many there are
     rows_out: wp.array3d(dtype=wp.int64),
-    own_out: wp.array2d(dtype=wp.int32),
     first_out: wp.array2d(dtype=wp.int32),
     voxels_out: wp.array(dtype=wp.int32),
     dropped_out: wp.array(dtype=wp.int32),
 ):
-    """Adds the points of a part to their voxels, as integers in units of 1 / scale, a power of two."""
-    n = wp.min(count_in[0], xyz_in.shape[0])
-    _sum_voxels(
-        part, parts, xyz_in, n, cells_in, slots_in, scale,
-        table, rows_out, own_out, first_out, voxels_out, dropped_out,
-    )  # fmt: skip
+    """The voxels of a part."""
+    _sum_own(part, parts, runs_in, ranges_in, table, rows_out, first_out, voxels_out, dropped_out)
 
 
-@wp.func_native("""
-    constexpr int Z_SLOT = 1, COUNT = 2, SUM = 3, ROW = 8, MOST = 64;
+@wp.func_native(
+    _RECORDS
+    + """
+    constexpr int MOST = 64;
     const long long capacity = rows_in.shape[1];
-    const long long* __restrict rows = rows_in.data + capacity * ROW * part;
+    const Row* __restrict row = (const Row*)rows_in.data + capacity * part;
     const int* __restrict first = first_in.data + capacity * part;
     float* __restrict centroids = (float*)centroids_out.data;
+    int* __restrict voxel_in = table.data + (long long)table.shape[1] * part;
     int passed[MOST] = {};
+    const bool at_once = voxels_in.data[part] > table.shape[1] / 16;  // are all slots freed, rather than one by one
     int place = 0;
     for (int voxel = 0; voxel < voxels_in.data[part]; ++voxel, ++place) {
         for (int other = 0; other < parts; ++other) {
@@ -196,18 +318,19 @@ def _sum_part(
             int& at = passed[other];
             for (; at < voxels_in.data[other] && theirs[at] < first[voxel]; ++at) ++place;
         }
-        const long long* __restrict row = rows + (long long)ROW * voxel;
-        const double inverse = 1.0 / ((double)row[COUNT] * (double)scale);
+        const double inverse = 1.0 / ((double)row[voxel].sum[3] * (double)scale);
         for (int axis = 0; axis < 3; ++axis)
-            centroids[3ll * place + axis] = (float)((double)row[SUM + axis] * inverse);
-        table.data[(long long)table.shape[1] * part + (int)(row[Z_SLOT] & 0x7FFFFFFF)] = -1;
+            centroids[3ll * place + axis] = (float)((double)row[voxel].sum[axis] * inverse);
+        if (!at_once) voxel_in[row[voxel].slot] = -1;
     }
+    if (at_once) memset(voxel_in, -1, sizeof(int) * table.shape[1]);
     if (part == 0) {
         int voxels = 0;
         for (int each = 0; each < parts; ++each) voxels += voxels_in.data[each];
         centroid_count_out.data[0] = voxels;
     }
-""")
+"""
+)
 def _write_centroids(
     part: int,
     parts: int,
@@ -260,7 +383,7 @@ class VoxelSums:
             capacity: Points that one launch can take.
             parts: Into how many the work is cut.
             device: A Warp device.
-            grid: 1 / the edge of a voxel, the reach, the integers per metre.
+            grid: 1 / the edge of a voxel, the reach, the integers per metre, a power of two.
             centroids: Shape (capacity,), vec3.
             centroid_count: Shape (1,), int32.
             dropped: Shape (1,), int32: points out of reach.
@@ -269,29 +392,26 @@ class VoxelSums:
         def buffer(shape: int | tuple[int, ...], dtype: type = wp.int32) -> wp.array:
             return wp.empty(shape, dtype=dtype, device=device)
 
-        inverse_size, limit, scale = grid
         slots = max(64, 2 << (capacity - 1).bit_length())
-        cells, first_slots = buffer(capacity, wp.vec3i), buffer(capacity)
         table = wp.full((parts, slots), -1, dtype=wp.int32, device=device)
-        # Whose a point is, is not known before: memory that is not used is not there either.
-        rows = buffer((parts, capacity, 8), wp.int64)
-        own, first, voxels = buffer((parts, capacity)), buffer((parts, capacity)), buffer(parts)
-        self._find_cells = packed_parts(
-            _find_cells_of_part, parts, device, [None, None, inverse_size, limit, slots], [cells, first_slots]
-        )
-        self._sum = packed_parts(
-            _sum_part,
-            parts,
-            device,
-            [None, None, cells, first_slots, scale],
-            [table, rows, own, first, voxels, dropped],
-        )
+        # Whose a run is, is not known before: memory that is not used is not there either.
+        rows, first = buffer((parts, capacity, _ROW_WORDS), wp.int64), buffer((parts, capacity))
+        voxels = buffer(parts)
+        summed = [table, rows, first, voxels, dropped]
+        if parts == 1:
+            self._first = packed_parts(_sum_all, None, device, [None, None, *grid], summed)
+            self._second = None
+        else:
+            runs, ranges = buffer((capacity + parts, _RUN_WORDS), wp.int64), buffer(parts, wp.vec3i)
+            self._first = packed_parts(_find_runs_of_part, parts, device, [None, None, *grid, slots], [runs, ranges])
+            self._second = packed_parts(_sum_part, parts, device, [runs, ranges], summed)
         self._write = packed_parts(
-            _write_part, parts, device, [rows, first, voxels, scale], [table, centroids, centroid_count]
+            _write_part, parts, device, [rows, first, voxels, grid[2]], [table, centroids, centroid_count]
         )
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
         """Sums the first `count[0]` points."""
-        self._find_cells(xyz_in=xyz, count_in=count)
-        self._sum(xyz_in=xyz, count_in=count)
+        self._first(xyz_in=xyz, count_in=count)
+        if self._second is not None:
+            self._second()
         self._write()

@@ -102,6 +102,20 @@ def test_cells_that_all_want_the_same_slots_of_their_blocks(way):
     assert dropped == 0
 
 
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_clouds_of_any_length_and_layout_of_rows(columns):
+    """Points are looked at by the block: lengths about those, and rows that end where their memory ends."""
+    table = np.repeat(street(11, 200), 3, axis=0)[:, [0, 1, 2, 3, 3]]  # runs of three
+    table[::41] = np.nan
+    for length in (1, 7, 8, 9, 127, 128, 129, 257, 600):
+        memory = np.ascontiguousarray(table[:length, :columns])
+        finite = memory[np.isfinite(memory[:, 0])]
+        np.testing.assert_allclose(voxel_downsample(memory, 2.0), reference(finite, 2.0), rtol=0, atol=1.6e-5)
+        last = memory[:, columns - 3 :]
+        finite = last[np.isfinite(last[:, 0])]
+        np.testing.assert_allclose(voxel_downsample(last, 2.0), reference(finite, 2.0), rtol=0, atol=1.6e-5)
+
+
 @pytest.mark.parametrize("kind", ["on a line", "equal", "denormal", "far", "backwards", "columns first"])
 def test_awkward_clouds(kind):
     rng = np.random.default_rng(8)
