@@ -52,6 +52,8 @@ class Backlog:
         """What waits, the oldest first: to be looked at."""
         self.on_taken: Callable[[Trigger], None] | None = None
         """Is told of each frame that is taken, in the thread that takes it."""
+        self.on_dropped: Callable[[Trigger], None] = lambda trigger: None
+        """Is told of each trigger that `offer` gives back, in the thread that offers."""
         self.gives_way: Callable[[], bool] = lambda: False
         """Whether it takes more than it has room for, rather than let a producer wait; `look_again` as that changes."""
         self._frames = 0  # of those that wait, the ones that are not settled
@@ -69,8 +71,8 @@ class Backlog:
         """Adds a trigger; with policy `block` waits for room.
 
         Returns:
-            The trigger that was dropped for it, or it itself when it was refused; None when nothing was lost. Whoever
-            offers settles its version. A settled one is only given back where very many wait, and is not counted.
+            The trigger that was dropped for it, or it itself when it was refused; None when nothing was lost. A settled
+            one is only given back where very many wait, and is not counted.
         """
         dropped: Trigger | None = None
         reason = "backlog"
@@ -85,8 +87,10 @@ class Backlog:
                 self._sleepers -= wakes
         if wakes:
             self._wakes.put(None)
-        if dropped is not None and not dropped.settled:
-            self._losses.count(self._place, reason, dropped.version)
+        if dropped is not None:
+            if not dropped.settled:
+                self._losses.count(self._place, reason, dropped.version)
+            self.on_dropped(dropped)
         return dropped
 
     def _make_room(self, trigger: Trigger) -> tuple[Trigger | None, str]:

@@ -206,18 +206,17 @@ class DataProcessComponent(Component):
                 losses=self.losses,
             )
         self.backlog = Backlog(self.name, backlog, self.losses)
+        self.backlog.on_dropped = self._on_dropped
         inputs = {name: self.inputs[name] for name in config.inputs}
         # Inline it runs when the commit is through: no other one to the topic waits for it.
         self._runs_later = self._inline and backlog.policy != "block" and bool(inputs)
-        after = self._advance if self._runs_later else None
+        offer, after = (self.backlog.offer, self._advance) if self._runs_later else (self._offer, None)
         self._windows = {name: one.window for name, one in inputs.items()}
         if config.any:
-            self._source = AnyTrigger(inputs, self._offer, after)
+            self._source = AnyTrigger(inputs, offer, after)
         elif config.all:
             tolerance = round(config.tolerance_ms * 1e6)
-            self._source = AllTrigger(
-                inputs, self._offer, after, tolerance_ns=tolerance, place=self.name, losses=self.losses
-            )
+            self._source = AllTrigger(inputs, offer, after, tolerance_ns=tolerance, place=self.name, losses=self.losses)
 
     @property
     def triggers_together(self) -> bool:
@@ -233,6 +232,7 @@ class DataProcessComponent(Component):
         """
         # It blocks, also where ticks of time would replace each other: nothing of what is given may be lost.
         self.backlog = Backlog(self.name, BacklogConfig(policy="block"), self.losses)
+        self.backlog.on_dropped = self._on_dropped
         self.backlog.gives_way = awaited.__bool__
         awaited.on_first.append(self.backlog.look_again)
         # Nor may the thread that plays serve a run which waits for what it plays next.
@@ -259,11 +259,11 @@ class DataProcessComponent(Component):
 
     def _offer(self, trigger: Trigger) -> None:
         assert self.backlog is not None
-        dropped = self.backlog.offer(trigger)
-        if dropped is not None:
-            self.settle(dropped.version, dropped.epoch)
-        if not self._runs_later and dropped is not trigger:
+        if self.backlog.offer(trigger) is not trigger:
             self._advance()
+
+    def _on_dropped(self, trigger: Trigger) -> None:
+        self.settle(trigger.version, trigger.epoch)
 
     def _advance(self) -> None:
         """Serves what waits in the calling thread, where that is how it runs and no other thread serves it already."""
@@ -510,9 +510,16 @@ class DagComponent(DataProcessComponent):
     def _data(self, trigger: Trigger) -> dict[str, Any] | None:
         """The data that triggered, by input; None, counted, where they are gone."""
         data: dict[str, Any] = {}
-        given = self._given.pop((trigger.epoch, trigger.version), {}) if self._given else {}
+        epoch = trigger.epoch
+        given = self._given.pop((epoch, trigger.version), None) if self._given else None
         for name, version in trigger.inputs.items():
-            entry = given.get(name) or self._windows[name].find(version, trigger.epoch)
+            state = self._windows[name].state
+            if given is not None:
+                entry = given[name]
+            elif state.epoch == epoch and state.versions and state.versions[-1] == version:
+                entry = state.entries[-1]  # the usual case, without a call
+            else:
+                entry = self._windows[name].find(version, epoch)
             if entry is None:
                 miss = self._windows[name].snapshot(trigger.epoch).miss(version)
                 self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)

@@ -220,7 +220,10 @@ class GraphEngine:
             for vertex in vertices:
                 vertex.queue.append(run)
             for vertex in self._roots:
-                ready += self._offer(vertex)
+                if vertex.running is None:
+                    vertex.running = vertex.queue.popleft()
+                    self._ready.append((vertex, vertex.running, False))
+                    ready += 1
             wakes = self._claim(ready - serves) if ready > serves else 0
         for _ in range(wakes):
             self._wakes.put(None)

@@ -386,7 +386,7 @@ class Output(_Handle[T]):
         change._arena = None
         now = window.clock.monotonic_ns()
         received = now if change._received_ns is None else change._received_ns
-        epoch = window.epoch if change._epoch == CURRENT_EPOCH else change._epoch
+        epoch = window.state.epoch if change._epoch == CURRENT_EPOCH else change._epoch
         entry = _new_entry((version, value, received, now, epoch, True, change._completion, None))
         status = window.commit(policy, entry, equal, triggers)
         if status is _REJECTED:

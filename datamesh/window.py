@@ -79,7 +79,8 @@ class Window(Generic[T]):
         self.check = check
         self.arena: Callable[[], Arena] | None = None
         """Gives the memory in which a payload is built that other processes read; None: this process's own."""
-        self._state: State[T] = State.empty(0)
+        self.state: State[T] = State.empty(0)
+        """What it holds: immutable, and replaced by each commit."""
         self._lock = threading.Lock()
         # Held from a commit to the end of its callbacks: subscribers see the commits in their order.
         self._commit_lock = threading.RLock()
@@ -93,7 +94,7 @@ class Window(Generic[T]):
     @property
     def epoch(self) -> int:
         """The epoch it is in."""
-        return self._state.epoch
+        return self.state.epoch
 
     def snapshot(self, epoch: int = CURRENT_EPOCH, stream: Any = None) -> Snapshot[T]:
         """What the window holds now.
@@ -103,12 +104,12 @@ class Window(Generic[T]):
             stream: Where the values will be read, so that it waits for those that a device is still writing. None:
                 on the host, so the calling thread waits.
         """
-        state = self._state
+        state = self.state
         return Snapshot(state if epoch == state.epoch else state.of_epoch(epoch), stream)
 
     def find(self, version: int, epoch: int = CURRENT_EPOCH) -> Entry[T] | None:
         """The datum of exactly a version, if it is there now; a device may still be writing it."""
-        state = self._state
+        state = self.state
         if epoch != state.epoch:
             state = state.of_epoch(epoch)
         if state.versions and state.versions[-1] == version:
@@ -186,7 +187,7 @@ class Window(Generic[T]):
         lost: tuple[tuple[str, int], ...] = ()
         status, oldest = _OK, None
         with self._lock:
-            epoch, versions, entries, evicted, settled, gone, previous = state = self._state
+            epoch, versions, entries, evicted, settled, gone, previous = state = self.state
             version = entry[0]
             if (
                 (not versions or version > versions[-1])
@@ -201,7 +202,7 @@ class Window(Generic[T]):
                     gone.append(evicted)
                     versions, entries = versions[1:], entries[1:]
                 versions, entries = versions + (version,), entries + (entry,)  # noqa: RUF005  in half the time
-                self._state = _new_state((epoch, versions, entries, evicted, settled, gone, previous))
+                self.state = _new_state((epoch, versions, entries, evicted, settled, gone, previous))
             else:
                 status, state, index, entry, lost = self._place(state, policy, entry, equal, triggers)
                 if status is _OK:
@@ -277,18 +278,18 @@ class Window(Generic[T]):
         settled = state.settled
         if settled and version in settled:
             settled = {other: None for other in settled if other != version}
-        self._state = _new_state((state.epoch, versions, entries, evicted, settled, state.gone, previous))
+        self.state = _new_state((state.epoch, versions, entries, evicted, settled, state.gone, previous))
         return entry
 
     def settle(self, version: int, epoch: int = CURRENT_EPOCH) -> None:
         """Says that there will be nothing at `version`, unless there is or was something, and tells the subscribers."""
-        state = self._state
+        state = self.state
         if state.versions and state.versions[-1] == version and epoch in (state.epoch, CURRENT_EPOCH):
             return  # the usual case: a component settles what it has committed
         if epoch > state.epoch:
             self.new_epoch(epoch)
         with self._lock:
-            state = self._state.of_epoch(epoch)
+            state = self.state.of_epoch(epoch)
             epoch = state.epoch
             if version in state.settled or version in state.versions:
                 return
@@ -300,10 +301,10 @@ class Window(Generic[T]):
             if len(settled) > _REMEMBERED:
                 del settled[next(iter(settled))]
             now = state._replace(settled=settled)
-            if state is self._state:
-                self._state = now
-            elif state is self._state.previous:
-                self._state = self._state._replace(previous=now)
+            if state is self.state:
+                self.state = now
+            elif state is self.state.previous:
+                self.state = self.state._replace(previous=now)
         for on_settle in self._on_settle:
             try:
                 on_settle(version, epoch)
@@ -323,15 +324,15 @@ class Window(Generic[T]):
         with self._commit_lock:
             self.flush()
             with self._lock:
-                self._state = self._stepped(self._state.epoch + 1 if epoch is None else epoch)
-                epoch = self._state.epoch
+                self.state = self._stepped(self.state.epoch + 1 if epoch is None else epoch)
+                epoch = self.state.epoch
             if self._waits:
                 self._end_waits()
             return epoch
 
     def _stepped(self, epoch: int) -> State[T]:
         """The state with which an epoch begins; the window's own where it is there already."""
-        state = self._state
+        state = self.state
         if epoch <= state.epoch:
             return state
         return State.empty(epoch, state._replace(previous=None))
@@ -345,7 +346,7 @@ class Window(Generic[T]):
         """
         waiting: Waiting[T] = Waiting(version, self.epoch if epoch == CURRENT_EPOCH else epoch, tolerance_ns, on_end)
         with self._lock:
-            decided = waiting.decide(self._state)
+            decided = waiting.decide(self.state)
             if decided is None:
                 self._waits.append(waiting)
         if decided is not None:
@@ -362,7 +363,7 @@ class Window(Generic[T]):
         ended = []
         with self._lock:
             for waiting in tuple(self._waits):
-                decided = waiting.decide(self._state)
+                decided = waiting.decide(self.state)
                 if decided is not None:
                     self._waits.remove(waiting)
                     ended.append((waiting, decided))
@@ -371,7 +372,7 @@ class Window(Generic[T]):
 
     def _hold(self, policy: Reorder, entry: Entry[T], equal: EqualVersion, triggers: bool | None) -> Status:
         """Holds a datum back until its turn, or commits it where that has passed."""
-        state = self._state
+        state = self.state
         if entry.epoch == CURRENT_EPOCH:
             entry = entry._replace(epoch=max([state.epoch, *(held.entry.epoch for held in self._held)]))
         order = (entry.epoch, entry.version)

@@ -210,7 +210,7 @@ def test_every_wait_ends_once_and_for_a_reason_that_was_true(events):
         if waiting.outcome is Outcome.SETTLED_EMPTY:
             assert waiting.version in seen_settled
         if waiting.outcome is Outcome.EVICTED:
-            assert window._state.evicted >= waiting.version + waiting.tolerance_ns
+            assert window.state.evicted >= waiting.version + waiting.tolerance_ns
 
 
 def test_many_threads_wait_and_each_is_woken_once():

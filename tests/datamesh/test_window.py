@@ -165,7 +165,7 @@ def test_the_memory_of_settled_and_evicted_versions_is_bounded():
     for version in range(0, 6000, 2):
         window.commit(DISCARD, entry(version))
         window.settle(version + 1)
-    assert len(window._state.settled) == len(window._state.gone) == 256
+    assert len(window.state.settled) == len(window.state.gone) == 256
     assert window.snapshot().miss(5999) is Miss.SETTLED_EMPTY
 
 
