@@ -1,4 +1,4 @@
-"""Tracking beside an object for each track, as AB3DMOT and many others have it, and beside norfair."""
+"""Tracking beside an object for each track, as AB3DMOT and many others have it, and beside norfair; and fusion."""
 
 import itertools
 import pathlib
@@ -8,7 +8,9 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from warploom.bench.contest import Contender, peer, record_figure
-from warploom.models.classes import VEHICLE
+from warploom.models.classes import CYCLIST, PEDESTRIAN, UNKNOWN, VEHICLE
+from warploom.models.fusion import Fusion
+from warploom.models.geometry import invert, transform_boxes
 from warploom.models.tracker import Tracker, TrackerConfig
 
 PERIOD = 100_000_000
@@ -172,3 +174,56 @@ def bench_tracking_thousands(contest, benchmark, contender, count):
         score=lambda tracked: f"{tracked} of {count} tracked",
     )
     frame_figures(benchmark, contender, f"{count} tracks, {count} detections", len(frames))
+
+
+def surrounded_drive():
+    """Two seconds of a street with the 13 cameras and 5 radars that the reference node's profile mounts.
+
+    The LiDAR has found the true objects, and 150 clusters that stand about them.
+    """
+    from warploom.components.node.transforms import mounting_matrix
+    from warploom.components.profile import load_profile
+    from warploom.components.sources import open_source
+    from warploom.components.sources.simulated_sensors import mounted_suite
+
+    sensors = load_profile("hw50_pandar90_13_600").content.sensors
+    mounted = {
+        kind: {one.name: mounting_matrix(one.mounting.xyz, one.mounting.rpy_deg) for one in sensors[kind]}
+        for kind in ("lidar", "camera", "radar")
+    }
+    source = open_source("sim:street?seed=7&duration=2&lidar=vlp16")
+    source.suite = mounted_suite(next(iter(mounted["lidar"].values())), mounted["camera"], mounted["radar"])
+    random = np.random.default_rng(7)
+    clusters = np.zeros((150, 7))
+    clusters[:, :2], clusters[:, 2] = random.uniform(-60, 60, (150, 2)), -0.9
+    clusters[:, 3:6], clusters[:, 6] = random.uniform(0.3, 3.0, (150, 3)), random.uniform(-3, 3, 150)
+    for frame in source:
+        known = np.isin(frame.truth.classes, (VEHICLE, PEDESTRIAN, CYCLIST)) & (frame.truth.points > 0)
+        boxes = np.concatenate([frame.truth.boxes[known], transform_boxes(clusters, invert(frame.pose))])
+        background = np.arange(len(boxes)) >= known.sum()
+        classes = np.concatenate([frame.truth.classes[known], np.full(len(clusters), UNKNOWN)])
+        yield frame, boxes, background, classes
+
+
+def bench_fusion_of_13_cameras_and_5_radars(benchmark):
+    """What joins the reference node's sensors and tracks, frame by frame."""
+    drive, fusion = list(surrounded_drive()), Fusion()
+
+    def fuse():
+        fusion.clear()
+        for frame, boxes, background, classes in drive:
+            objects = fusion.update(
+                frame.version, boxes, np.full(len(boxes), 0.6), classes, background=background, pose=frame.pose,
+                cameras=frame.cameras.cameras, radars=frame.radars.radars,
+            )  # fmt: skip
+        return objects
+
+    benchmark.extra_info.update(kernel="fusion", on=f"13 cameras, 5 radars, {len(drive)} frames")
+    objects = benchmark.pedantic(fuse, rounds=10, warmup_rounds=2)
+    seen = np.mean([len(camera.boxes) for frame, *_ in drive for camera in frame.cameras.cameras])
+    if benchmark.stats is not None:
+        note = (
+            f"{np.mean([len(each[1]) for each in drive]):.0f} detections, {len(objects)} objects, {seen:.0f} a camera"
+        )
+        shortest = 1e3 * benchmark.stats.stats.min / len(drive)
+        record_figure(benchmark, "fusion of 13 cameras and 5 radars, a frame", shortest, "ms", goal=6.0, note=note)

@@ -25,7 +25,7 @@ from .fusion_sensors import (
     RadarView,
     Targets,
     camera_support,
-    distance_outside,
+    nearest_boxes,
     radar_support,
     radar_targets,
 )
@@ -230,45 +230,40 @@ class Fusion:
         safe = np.where(usable[:, None], boxes, 0.0)
 
         likely = _class_evidence(classes, np.where(background, 0.0, np.nan_to_num(scores)))
-        by_camera, camera_miss = np.zeros(n, bool), np.zeros(n)
-        for camera in cameras:
-            support = camera_support(
-                safe, usable & ~background, camera, pose=pose, age=ages[camera.sensor],
-                least_overlap=config.camera_overlap, velocities=velocities,
-            )  # fmt: skip
-            seen = support.seen & usable
-            row = support.row[seen]
-            sure = np.clip(np.asarray(camera.scores, np.float64)[row], 0.0, 1.0)
-            likely[seen] += _class_evidence(np.asarray(camera.classes, np.int64)[row], sure)
-            scores[seen] = _either(scores[seen], config.camera_weight * sure)
-            by_camera |= seen
-            camera_miss += np.where(support.expected & usable & ~seen, config.camera_miss, 0.0)
+        images = camera_support(
+            safe, usable & ~background, cameras, pose=pose, ages=[used[each.sensor] for each in cameras],
+            least_overlap=config.camera_overlap, velocities=velocities,
+        )  # fmt: skip
+        camera, box = np.nonzero(images.seen & usable)
+        sure, kinds = _said_of(cameras, images.row, camera, box)
+        np.add.at(likely, box, _class_evidence(kinds, sure))
+        _make_surer(scores, box, config.camera_weight * sure)
+        by_camera = (images.seen & usable).any(0)
+        camera_miss = config.camera_miss * (images.expected & usable & ~images.seen).sum(0)
         # Cameras vote on the class of an object over time, in `_gate`: a class that changed with one image would tear
         # its track. A cluster becomes an object at once where a camera knows what it is and it is one as a whole.
         named = by_camera & background & _fits(likely.argmax(1), safe)
         classes[named] = likely[named].argmax(1)
         background[named] = False
 
-        by_radar, radial = np.zeros(n, bool), np.full((n, 4), np.nan)
+        radial = np.full((n, 4), np.nan)
         ego_velocity = self._ego_velocity(version, pose)
-        echoes: list[Targets] = []
-        for radar in radars:
-            targets = radar_targets(radar, pose, ages[radar.sensor], ego_velocity)
-            gates = {"gate": config.radar_gate, "angle": config.radar_angle}
-            support = radar_support(safe, targets, **gates)
-            seen = support.seen & usable
-            row = support.row[seen]
-            scores[seen] = _either(scores[seen], config.radar_weight * np.clip(targets.scores[row], 0.0, 1.0))
-            radial[seen, :2], radial[seen, 2] = targets.directions[row], targets.speeds[row]
-            radial[seen, 3] = config.radar_speed_std
-            by_radar |= seen
-            echoes.append(targets)
+        targets = radar_targets(radars, pose, [used[each.sensor] for each in radars], ego_velocity)
+        echoes = radar_support(
+            safe, targets, radars=len(radars), gate=config.radar_gate, angle=config.radar_angle
+        )  # fmt: skip
+        radar, box = np.nonzero(echoes.seen & usable)
+        row = echoes.row[radar, box]
+        _make_surer(scores, box, config.radar_weight * np.clip(targets.scores[row], 0.0, 1.0))
+        radial[box, :2], radial[box, 2] = targets.directions[row], targets.speeds[row]  # of several radars the last
+        radial[box, 3] = config.radar_speed_std
+        by_radar = (echoes.seen & usable).any(0)
 
         tracks = self.tracker.update(
             version, boxes, scores, classes, background=background, velocities=velocities, radial=radial, pose=pose
         )
         level = float(np.median(safe[usable, 2])) if usable.any() else 0.0
-        own = self._track_radar(version, echoes, pose, level)
+        own = self._track_radar(version, targets, pose, level)
         seconds = 0.0 if self._last is None else (version - self._last[0]) * 1e-9
         self._last = (version, pose)
         return self._gate(version, seconds, tracks, own, scores, likely, by_camera, camera_miss, by_radar, used)
@@ -286,13 +281,9 @@ class Fusion:
             return None
         return pose[:3, :3].T @ (pose[:3, 3] - self._last[1][:3, 3]) / ((version - self._last[0]) * 1e-9)
 
-    def _track_radar(self, version: int, echoes: list[Targets], pose: np.ndarray | None, level: float) -> Tracks:
+    def _track_radar(self, version: int, targets: Targets, pose: np.ndarray | None, level: float) -> Tracks:
         """Tracks of moving targets, whether the LiDAR sees them or not, at a height of `level`."""
-        none = np.empty((0, 2))
-        places = np.concatenate([none, *(t.positions for t in echoes)])
-        directions = np.concatenate([none, *(t.directions for t in echoes)])
-        speeds = np.concatenate([[], *(t.speeds for t in echoes)])
-        scores = np.concatenate([[], *(t.scores for t in echoes)])
+        places, directions, speeds, scores = targets.positions, targets.directions, targets.speeds, targets.scores
         # Without the ego's motion nobody can tell what moves.
         moving = np.abs(speeds) >= self.config.least_radar_speed if pose is not None else np.zeros(len(speeds), bool)
         places, directions, speeds, scores = places[moving], directions[moving], speeds[moving], scores[moving]
@@ -369,10 +360,9 @@ class Fusion:
         """The radar's tracks that are none of the LiDAR's; the others share their ids with these."""
         if not len(own) or not len(tracks):
             return own
-        off = distance_outside(own.boxes[:, :2], tracks.boxes)
-        nearest = off.argmin(0)
         gate = self.config.radar_gate + self.config.radar_angle * np.hypot(own.boxes[:, 0], own.boxes[:, 1])
-        same = off[nearest, np.arange(len(own))] < gate + own.position_std
+        nearest = nearest_boxes(own.boxes[:, :2], tracks.boxes, gate + own.position_std)
+        same = nearest >= 0
         for k in np.flatnonzero(same):
             radar, lidar = ("radar", int(own.ids[k])), ("lidar", int(tracks.ids[nearest[k]]))
             if lidar in self._names:
@@ -418,9 +408,30 @@ def _some(table: Any, rows: np.ndarray) -> Any:
     return replace(table, **{name: getattr(table, name)[rows] for name in vars(table)})
 
 
-def _either(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The probability that at least one of two is right."""
-    return 1.0 - (1.0 - np.clip(a, 0.0, 1.0)) * (1.0 - b)
+def _said_of(
+    cameras: Sequence[CameraView], rows: np.ndarray, camera: np.ndarray, box: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores in [0, 1] and classes of the detections that cameras have of boxes, each of shape (m,).
+
+    Args:
+        cameras: With their detections.
+        rows: Which detection of a camera belongs to a box, shape (c, n).
+        camera: Of each pair, shape (m,).
+        box: Likewise.
+    """
+    none = np.empty(0)
+    scores = np.concatenate([none, *(np.reshape(each.scores, -1) for each in cameras)])
+    kinds = np.concatenate([none, *(np.reshape(each.classes, -1) for each in cameras)]).astype(np.int64)
+    counts = np.array([np.size(each.scores) for each in cameras], np.int64)
+    at = (np.cumsum(counts) - counts)[camera] + rows[camera, box]
+    return np.clip(scores[at], 0.0, 1.0), kinds[at]
+
+
+def _make_surer(scores: np.ndarray, rows: np.ndarray, others: np.ndarray) -> None:
+    """Makes of each score the probability that it or one of the others in its row is right."""
+    doubt = 1.0 - np.clip(scores, 0.0, 1.0)
+    np.multiply.at(doubt, rows, 1.0 - others)
+    scores[rows] = 1.0 - doubt[rows]
 
 
 def _class_evidence(classes: np.ndarray, scores: np.ndarray) -> np.ndarray:

@@ -65,21 +65,24 @@ def test_boxes_are_projected_as_the_camera_saw_them():
     before = world - [0.5, 0, 0, 0, 0, 0, 0]
     expected = image_of(transform_boxes(before[None], invert(earlier)))
     view = dataclasses.replace(camera(0, NOTHING), pose=earlier)
-    found, inside = image_boxes(now, view, pose, velocity, 0.05)
+    found, inside = image_boxes(now, [view], pose, velocity, [0.05])
     # 1e-3 pixels: a heading moved and turned back is laid onto the plane twice
-    np.testing.assert_allclose(found, expected, atol=1e-3)
+    np.testing.assert_allclose(found[0], expected, atol=1e-3)
     assert inside.all()
 
 
 def test_what_is_behind_or_beside_the_camera_is_not_expected_in_it():
-    _, inside = image_boxes(np.array([car(-20), car(20, 40), car(20), car(0.5)]), camera(0, NOTHING), None, None, 0.0)
-    assert inside.tolist() == [False, False, True, False]
+    boxes = np.array([car(-20), car(20, 40), car(20), car(0.5)])
+    _, inside = image_boxes(boxes, [camera(0, NOTHING)], None, None, [0.0])
+    assert inside.tolist() == [[False, False, True, False]]
 
 
 def test_the_image_object_goes_to_the_box_that_overlaps_it_most():
     boxes = np.array([car(30, 3), car(30, 0), car(30, -3)])
-    support = camera_support(boxes, np.ones(3, bool), camera(0, boxes[[2, 1]]), pose=None, age=0.0, least_overlap=0.3)
-    assert support.row.tolist() == [-1, 1, 0]
+    support = camera_support(
+        boxes, np.ones(3, bool), [camera(0, boxes[[2, 1]])], pose=None, ages=[0.0], least_overlap=0.3
+    )
+    assert support.row.tolist() == [[-1, 1, 0]]
     assert support.expected.all()
 
 
@@ -92,22 +95,22 @@ def test_radial_speeds_come_out_over_ground_along_the_line_of_sight():
     seen = transform_points(place[None], to_radar)
     own = np.array([9.0, 0.5, 0.0])
     view = radar(0, seen, velocity @ to_radar[:3, :3].T, own=own, mounting=mounting, pose=earlier)
-    targets = radar_targets(view, pose, 0.04, None)
+    targets = radar_targets([view], pose, [0.04], None)
     ray = (place - (earlier @ mounting)[:3, 3]) / np.linalg.norm(seen)
     now = place + 0.04 * (velocity @ ray) * ray
     np.testing.assert_allclose(targets.speeds, [velocity @ ray], atol=1e-5)  # float32
     np.testing.assert_allclose(targets.positions, transform_points(now[None], invert(pose))[:, :2], atol=1e-4)
     direction = pose[:3, :3].T @ ray
     np.testing.assert_allclose(targets.directions[0], direction[:2] / np.linalg.norm(direction[:2]), atol=1e-6)
-    assert np.isnan(radar_targets(dataclasses.replace(view, velocity=None), pose, 0.04, None).speeds).all()
+    assert np.isnan(radar_targets([dataclasses.replace(view, velocity=None)], pose, [0.04], None).speeds).all()
 
 
 def test_a_target_belongs_to_the_nearest_box_and_a_box_to_its_surest_target():
     boxes = np.array([car(30), car(37)])
     view = radar(0, [[28.0, 0, 0], [31, 1.5, 0], [34.8, 0, 0], [60, 0, 0]], np.zeros((4, 3)))
     view = dataclasses.replace(view, scores=np.array([0.5, 0.9, 0.4, 0.9], np.float32))
-    support = radar_support(boxes, radar_targets(view, None, 0.0, None), gate=1.0, angle=0.0)
-    assert support.row.tolist() == [1, 2]
+    support = radar_support(boxes, radar_targets([view], None, [0.0], None), radars=1, gate=1.0, angle=0.0)
+    assert support.row.tolist() == [[1, 2]]
 
 
 def test_a_faint_detection_exists_where_a_camera_or_a_radar_agrees():

@@ -41,7 +41,7 @@ def test_a_perfect_detector_finds_the_true_boxes_where_the_projection_puts_them(
     suite = SensorSuite(detector=CameraDetector(edge_noise=0.0, size_noise=0.0, confusion=0.0, false_objects=0.0))
     for camera in suite.cameras_of(drive, frame).cameras:
         velocities = frame.velocities.astype(float)
-        boxes, _ = image_boxes(frame.boxes, camera, frame.pose, velocities, 0.05)
+        (boxes,), _ = image_boxes(frame.boxes, [camera], frame.pose, velocities, [0.05])
         assert len(camera.boxes) > 3
         for box, kind in zip(camera.boxes, camera.classes, strict=True):
             off = np.abs(boxes - box).max(1)
@@ -54,7 +54,7 @@ def test_radar_targets_lie_on_true_objects_and_go_as_they_do(source, frames):
     on_something = total = 0
     for frame in frames:
         for radar in frame.radars.radars:
-            targets = radar_targets(radar, frame.pose, 0.03, None)
+            targets = radar_targets([radar], frame.pose, [0.03], None)
             centres, velocities = frame.truth.boxes[:, :2].astype(float), frame.truth.velocities.astype(float)
             for place, direction, speed in zip(targets.positions, targets.directions, targets.speeds, strict=True):
                 near = np.linalg.norm(centres - place, axis=1) < 4.0 + 0.02 * np.linalg.norm(place)
