@@ -14,16 +14,16 @@ import warp as wp
 
 from .beams import MATERIALS, NO_HIT, turn_at, uniform
 
-__all__ = ["ECHO_BLOCK", "compact_echoes", "make_echoes"]
+__all__ = ["DROP_REACH", "DROP_ZONE", "compact_echoes", "make_echoes"]
 
-ECHO_BLOCK = wp.constant(256)
-"""Beams of a part's turn on a CPU."""
+DROP_REACH = wp.constant(4.0)
+"""Mean range of the echoes of drops; farther ones are too weak [m]."""
+DROP_ZONE = wp.constant(10.0)
+"""Within which they are seen [m]."""
 
 _MATERIAL_MASK = wp.constant(MATERIALS - 1)
 _CLASS_SHIFT = wp.constant(8)
 _REFLECTIVITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in (0, 2, 3, 4))
-_DROP_REACH = wp.constant(4.0)  # [m] mean range of the echoes of drops; farther ones are too weak
-_DROP_ZONE = wp.constant(10.0)  # [m] within which they are seen
 
 
 @wp.func
@@ -65,8 +65,6 @@ def _mixed(
 
 @wp.kernel
 def make_echoes(
-    part: int,
-    parts: int,
     # in: hits
     beams_in: wp.array(dtype=wp.vec3),
     fraction_in: wp.array(dtype=wp.float32),
@@ -99,9 +97,7 @@ def make_echoes(
 
     Beams of several worlds lie one world after the other.
     """
-    i = (wp.tid() // ECHO_BLOCK * parts + part) * ECHO_BLOCK + wp.tid() % ECHO_BLOCK
-    if i >= distance_in.shape[0]:
-        return
+    i = wp.tid()
     kept_out[i] = 0
     n = beams_in.shape[0]
     world = i // n
@@ -113,9 +109,9 @@ def make_echoes(
     rain = rain_in[world]
     if rain[1] > 0.0:
         u = uniform(seed, k, wp.uint32(21))
-        if u < rain[1] * _DROP_ZONE:
+        if u < rain[1] * DROP_ZONE:
             # What is left of u is as good as new: a range that falls off exponentially.
-            drop = min_range - _DROP_REACH * wp.log(1.0 - 0.9999 * u / (rain[1] * _DROP_ZONE))
+            drop = min_range - DROP_REACH * wp.log(1.0 - 0.9999 * u / (rain[1] * DROP_ZONE))
             if drop < wp.where(label >= 0, d, max_range):
                 kept_out[i] = 1
                 range_out[i] = drop

@@ -19,11 +19,12 @@ import warp as wp
 
 from .beams import MATERIALS, NO_HIT, first_hit, ray_of
 from .device import DEFAULT_DEVICE
-from .echoes import ECHO_BLOCK, compact_echoes, make_echoes
+from .echo_parts import ECHO_BLOCK, echo_part
+from .echoes import compact_echoes, make_echoes
 from .interop import borrow, family_of, give
 from .meshes import MeshSet
 from .ray_packets import cast_packets, hit_packets
-from .threads import launch_parts, run_together, thread_count
+from .threads import launch_parts, thread_count
 
 __all__ = ["MATERIALS", "LidarCast", "RayHits", "raycast"]
 
@@ -32,19 +33,6 @@ _BLOCK = int(ECHO_BLOCK)
 # Of rain of 1 mm/h: what it takes of a signal both ways [1/m] (Goodin et al. 2019), and the share of beams that a drop
 # sends back, a metre [1/m]: a judgement, 2 % of the beams within the first ten metres at 10 mm/h.
 _RAIN_LOSS, _RAIN_ECHOES, _MOST_ECHOES = 0.02, 5.0e-4, 0.02
-
-
-def _launch_in_parts(kernel: wp.Kernel, parts: int, n: int, device: str, inputs: list, outputs: list) -> None:
-    """One beam a thread on a GPU; on a CPU parts, which take turns by blocks of beams."""
-    if parts == 1 or wp.get_device(device).is_capturing:
-        wp.launch(kernel, n, inputs=[0, 1, *inputs], outputs=outputs, device=device)
-        return
-    dim = -(-n // (_BLOCK * parts)) * _BLOCK
-    launches = [
-        wp.launch(kernel, dim, inputs=[part, parts, *inputs], outputs=outputs, device=device, record_cmd=True)
-        for part in range(parts)
-    ]
-    run_together([launch.launch for launch in launches])
 
 
 @wp.kernel
@@ -324,18 +312,16 @@ class LidarCast:
         """
         device, n = self.meshes.device, self.worlds * self._beams.shape[0]
         self.cast()
-        _launch_in_parts(
-            make_echoes,
-            self._parts,
-            n,
-            device,
-            [
-                self._beams, self._fraction, self._ring, self._pose, self.distance, self.hit_label, self.hit_instance,
-                self.hit_normal, self._material, self._seed, self._rain, self.min_range, self.max_range, self.reach,
-                self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
-            ],
-            [self._kept, self._range, self._intensity, self._label, self._instance],
-        )  # fmt: skip
+        given = [
+            self._beams, self._fraction, self._ring, self._pose, self.distance, self.hit_label, self.hit_instance,
+            self.hit_normal, self._material, self._seed, self._rain, self.min_range, self.max_range, self.reach,
+            self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
+        ]  # fmt: skip
+        echoes = [self._kept, self._range, self._intensity, self._label, self._instance]
+        if self._packets:
+            launch_parts(echo_part, self._parts, given, echoes)
+        else:
+            wp.launch(make_echoes, n, inputs=given, outputs=echoes, device=device)
         wp.utils.array_scan(self._kept, self._rank, inclusive=False)
         wp.launch(
             compact_echoes,
