@@ -42,6 +42,8 @@ _PLACE = struct.Struct("<IQ")
 _STR = ord("s")
 _forms: dict[bytes, tuple[np.dtype, int, struct.Struct]] = {}
 """Types of arrays with their numbers of dimensions, by their bytes."""
+_references: dict[bytes, tuple[np.dtype, Callable[..., tuple], int]] = {}
+"""The same of arrays by reference, with what unpacks shape and place, and the size of these [B]."""
 
 
 @dataclass(frozen=True)
@@ -389,14 +391,36 @@ class Decoder:
         return np.frombuffer(self._take(size), dtype).reshape(shape).copy()
 
     def _reference(self, depth: int) -> np.ndarray:
-        dtype, shape, size = self._form(depth)
-        number, offset = _PLACE.unpack(self._take(_PLACE.size))
-        if number >= len(self._memories):
-            raise ValueError(f"an array in memory {number}, of which there are {len(self._memories)} here")
-        memory = self._memories[number]
-        if offset + size > len(memory):
-            raise ValueError(f"an array at {offset} to {offset + size} of a memory of {len(memory)} bytes")
-        return np.ndarray(shape, dtype, memory, offset)
+        data, position = self.data, self.position
+        size = data[position + 1] if position + 1 < len(data) and data[position] == _STR else 0
+        form = _references.get(bytes(data[position : position + size + 9])) if size else None
+        if form is None:
+            form = self._new_reference(depth, position)
+            position = self.position
+        else:  # the usual case: a type and number of dimensions that came before
+            position += size + 9
+        dtype, unpack_from, size = form
+        self.position = end = position + size
+        if end > len(data):
+            raise ValueError(f"truncated: {size} bytes expected at byte {position} of {len(data)}")
+        *shape, number, offset = unpack_from(data, position)
+        try:
+            return np.ndarray(shape, dtype, self._memories[number], offset)
+        except IndexError:
+            count = len(self._memories)
+            raise ValueError(f"an array in memory {number}, of which there are {count} here") from None
+        except (TypeError, ValueError, OverflowError):
+            end, size = offset + math.prod(shape) * dtype.itemsize, len(self._memories[number])
+            raise ValueError(f"an array at {offset} to {end} of a memory of {size} bytes") from None
+
+    def _new_reference(self, depth: int, start: int) -> tuple[np.dtype, Callable[..., tuple], int]:
+        """Type, what unpacks shape and place, and the size of these [B]."""
+        dtype, _, shapes = self._new_form(depth, start)
+        packed = struct.Struct(f"{shapes.format}IQ")
+        form = dtype, packed.unpack_from, packed.size
+        if self.data[start] == _STR and len(_references) < 256:
+            _references[bytes(self.data[start : self.position])] = form
+        return form
 
     def _scalar(self, depth: int) -> Any:
         dtype = _dtype_of(self.value(depth))

@@ -24,6 +24,8 @@ class SharedMemoryConfig(BaseModel):
     """How much memory they may take together, about [B]."""
     kept_s: float = Field(10.0, ge=0.0)
     """For how long [s]."""
+    announce: bool = True
+    """Whether readers are woken when a payload is begun that is built in place, so as to be ready for it."""
     retry_ms: float = Field(20.0, gt=0.0)
     """How long a reader waits before it looks for its producer again [ms]."""
 

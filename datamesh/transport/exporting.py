@@ -13,8 +13,9 @@ import os
 import select
 import socket
 import threading
+import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -39,11 +40,13 @@ from .wire import (
     MESSAGE,
     RELEASE,
     SETTLE,
+    SOON,
     Event,
     new_event,
     pack_event,
     pack_greeting,
     read_greeting,
+    set_number,
 )
 
 __all__ = ["Exporter"]
@@ -51,6 +54,11 @@ __all__ = ["Exporter"]
 _log = logging.getLogger(__name__)
 
 _COUNTING_S = 0.1
+_COLD_NS = 2_000_000
+"""After a pause of this length a processor's caches hold other things than what receives a datum [ns]."""
+_LONG_NS = 4_000_000
+"""Where a payload takes this long to build, they do so again before it comes [ns]."""
+_soon = pack_event(Event(SOON, 0, 0, 0, 0, 0))
 _NAMES = 256
 """Of how many readers it is known what they were sent, for when they come back."""
 
@@ -91,6 +99,7 @@ class Exporter:
         self._reached: dict[str, tuple[int, int]] = {}
         self._stopped = False
         self._built = self._copied = Usage()
+        self._begun_ns = self._took_ns = self._told_ns = 0
         self._newest = self._newest_of(window)
         self._absent = Absent(self._config, self._on_lost)
         self._behind: list[Reader] = []
@@ -140,9 +149,19 @@ class Exporter:
     # Memory
 
     def _arena(self) -> SlabArena:
+        self._begun_ns = now = time.perf_counter_ns()
+        if self._config.announce and now - self._told_ns > _COLD_NS and self._took_ns < _LONG_NS:
+            self._announce()
         arena = SlabArena(self._lease, self._built.size, partial(self._count, "no_memory"))
         self._built = arena.used
         return arena
+
+    def _announce(self) -> None:
+        """Wakes the readers while the payload is built, for them to be ready when it comes."""
+        for reader in tuple(self._readers):
+            if reader.kept is None and not reader.is_full:
+                with suppress(OSError):  # it is gone, or has enough to read
+                    reader.send(_soon)
 
     def _lease(self, size: int) -> Lease | None:
         with self._lock:
@@ -170,7 +189,7 @@ class Exporter:
             newest = order > self._newest or self._window.snapshot().versions[-1] == version
             if newest:
                 self._newest = order
-            if self._absent:
+            if self._absent.readers:
                 self._absent.add(entry, self._size)
             readers = self._readers
             if self._behind:
@@ -179,6 +198,8 @@ class Exporter:
             if readers:
                 self._tell(entry, epoch, newest, readers)
             self._counts["commits"] += 1
+            self._told_ns = now = time.perf_counter_ns()
+            self._took_ns = now - self._begun_ns
 
     def _on_settle(self, version: int, epoch: int) -> None:
         with self._lock:
@@ -186,33 +207,20 @@ class Exporter:
                 return
             seen = self.order.settled(epoch, version)
             if seen is not None:
+                message = pack_event(Event(SETTLE, 0, seen, version, 0, 0))
                 for reader in tuple(self._readers):
-                    self._send(reader, Event(SETTLE, 0, seen, version, 0, 0))
+                    self._send(reader, message, version)
 
     def _tell(self, entry: Entry, epoch: int, newest: bool, readers: list[Reader]) -> None:
         """Sends a datum to readers."""
-        encoded = self._encoded(entry, epoch, newest, readers)
+        encoded = self._encode(entry, epoch, newest, readers)
         if encoded is None:
             return
-        event, slabs, leases = encoded
+        message, slabs, leases = encoded
         for reader in tuple(readers):
-            if self._send(reader, event, slabs):
+            if self._send(reader, message, entry.version, slabs):
                 reader.has_sent(entry, epoch, bool(slabs))
         del leases  # until here they hold the slabs that were copied to
-
-    def _encoded(
-        self, entry: Entry, epoch: int, newest: bool, readers: list[Reader]
-    ) -> tuple[Event, list[Slab], list[Lease]] | None:
-        """What `_encode` gives; None where it fails, which is counted for the readers."""
-        try:
-            return self._encode(entry, epoch, newest)
-        except NoRoom:
-            self._lose("no_memory", entry.version, readers)
-        except (TypeError, ValueError) as error:
-            if not self._counts["not_encodable"]:
-                _log.warning("%s: version %d is not sent: %s", self._window.topic, entry.version, error)
-            self._lose("not_encodable", entry.version, readers)
-        return None
 
     def _lose(self, reason: str, version: int, readers: list[Reader]) -> None:
         for reader in readers:
@@ -220,33 +228,43 @@ class Exporter:
         self._counts[reason] += len(readers)
         self._window.losses.count(self._window.topic, f"link_{reason}", version, len(readers))
 
-    def _encode(self, entry: Entry, epoch: int, newest: bool) -> tuple[Event, list[Slab], list[Lease]]:
-        """A datum as an event, the slabs that it is in, and what holds those that were taken for it.
+    def _encode(
+        self, entry: Entry, epoch: int, newest: bool, readers: list[Reader]
+    ) -> tuple[bytearray, list[Slab], tuple[Lease, ...]] | None:
+        """A datum as a message, the slabs that it is in, and what holds those that were taken for it.
 
-        Raises:
-            NoRoom: There is no room to copy it to.
-            TypeError: It has no form as a message.
+        None where it has no form as a message, or there is no room to copy it to, which is counted for the readers.
         """
         version, value, received, committed, _, triggers, completion, _ = entry
-        if completion is not None:  # on the host: what a device still writes is waited for
-            value = entry.read()
         placing = Placing(self._pool, self._lease, self._copied.size)
-        body, size = encode(value, placing), 0
-        slabs = placing.slabs
+        size = 0
+        try:
+            if completion is not None:  # on the host: what a device still writes is waited for
+                value = entry.read()
+            body = encode(value, placing)
+            if len(body) > INLINE:
+                one = placing.take(len(body))
+                one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
+                placing.slabs.append(one.key)
+                size, body = len(body), b""
+        except NoRoom:
+            self._lose("no_memory", version, readers)
+            return None
+        except (TypeError, ValueError) as error:
+            if not self._counts["not_encodable"]:
+                _log.warning("%s: version %d is not sent: %s", self._window.topic, version, error)
+            self._lose("not_encodable", version, readers)
+            return None
         if placing.copies is not None:
             self._counts["copied"] += 1
             self._counts["copied_bytes"] += placing.copied_bytes
             self._copied = placing.copies.used
-        if len(body) > INLINE:
-            one = placing.take(len(body))
-            one.bytes()[: len(body)] = np.frombuffer(body, np.uint8)
-            slabs.append(one.key)
-            size, body = len(body), b""
-        parts: tuple[tuple[int, int], ...] = ()
+        slabs = placing.slabs
+        places: tuple[tuple[int, int], ...] = ()
         for slab in slabs:
-            parts += ((slab.offset, slab.size),)
-        event = new_event((COMMIT, 0, epoch, version, received, committed, triggers, newest, parts, body, size))
-        return event, slabs, placing.leases
+            places += ((slab.offset, slab.size),)
+        event = new_event((COMMIT, 0, epoch, version, received, committed, triggers, newest, places, body, size))
+        return pack_event(event), slabs, placing.leases
 
     # Readers
 
@@ -383,11 +401,12 @@ class Exporter:
         """Sends a datum again, or late; tells whether it is done with."""
         epoch = self.order.epoch(entry.epoch, entry.version)
         entry = entry._replace(triggers=entry.triggers and not sent)
-        encoded = self._encoded(entry, epoch, False, [reader])
+        encoded = self._encode(entry, epoch, False, [reader])
         if encoded is None:
             return True
-        event, slabs, _leases = encoded
-        if not self._try_send(reader, pack_event(event, reader.number + 1), slabs):
+        message, slabs, _leases = encoded
+        set_number(message, reader.number + 1)
+        if not self._try_send(reader, message, slabs):
             return False
         reader.number += 1
         reader.has_sent(entry, epoch, bool(slabs))
@@ -395,27 +414,27 @@ class Exporter:
 
     # Messages
 
-    def _send(self, reader: Reader, event: Event, slabs: list[Slab] | tuple[()] = ()) -> bool:
+    def _send(self, reader: Reader, message: bytearray, version: int, slabs: Sequence[Slab] = ()) -> bool:
         """Sends an event, if the reader has room; one that blocks its producer is waited for. Tells whether it did."""
-        reader.number += 1
-        data = pack_event(event, reader.number)
-        while not self._try_send(reader, data, slabs):
+        reader.number = number = reader.number + 1
+        set_number(message, number)
+        while not self._try_send(reader, message, slabs):
             if reader.ended:
                 return False
             if not reader.blocks or self._stopped:
                 self._counts["slow"] += 1
-                self._window.losses.count(self._window.topic, "link_slow", event.version)
+                self._window.losses.count(self._window.topic, "link_slow", version)
                 return False
             reader.wait(full=bool(slabs) and reader.is_full)
         return True
 
-    def _try_send(self, reader: Reader, data: bytes, slabs: list[Slab] | tuple[()]) -> bool:
-        if slabs and reader.is_full:
+    def _try_send(self, reader: Reader, message: bytearray, slabs: Sequence[Slab]) -> bool:
+        if slabs and reader.held >= reader.most:
             self._collect(reader)
             if reader.is_full:
                 return False
         try:
-            reader.send(data)
+            reader.send(message)
         except BlockingIOError:
             self._collect(reader)
             return False
@@ -425,7 +444,7 @@ class Exporter:
                 self._drop(reader)
             return False
         self._counts["sent"] += 1
-        self._counts["sent_bytes"] += len(data)
+        self._counts["sent_bytes"] += len(message)
         reader.holds(slabs)
         return True
 

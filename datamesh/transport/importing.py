@@ -12,7 +12,7 @@ import os
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -24,8 +24,8 @@ from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
 from .places import connect, peer_of
-from .slabs import Lease, Region
-from .wire import ENDS, LEAVES, MESSAGE, RELEASE, SETTLE, Event, pack_greeting, read_event, read_greeting
+from .slabs import Region
+from .wire import ENDS, LEAVES, MESSAGE, RELEASE, SETTLE, SOON, Event, pack_greeting, read_event, read_greeting
 
 __all__ = ["Importer", "publish"]
 
@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 # Members of enums take longer to look up than to compare.
 _OVERWRITE, _INSERT_SORTED, _REPLACE = CommitPolicy.OVERWRITE, CommitPolicy.INSERT_SORTED, EqualVersion.REPLACE
 _new_entry = partial(tuple.__new__, Entry)
+_AT_ONCE = int(socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
 _STOP_S = 5.0
 """How long a component whose backlog blocks may keep the thread that receives."""
@@ -47,12 +48,10 @@ class _Connection:
         self.region = region
         self.writer = writer
         self._waiting: deque[bytes] = deque()
+        self.scratch: Window[Any] = Window("rehearsal", 1)
+        """Takes in rehearsals what the topic's window takes otherwise."""
         self.busy = False
         """While a datum is being read, it is told afterwards which slabs are no longer needed."""
-
-    def lease(self, slab: tuple[int, int]) -> Lease:
-        """A slab, which the writer is told of when it is no longer needed."""
-        return self.region.lease(*slab, slab[0], self._let_go)
 
     def __del__(self) -> None:
         # Whose slabs are let go of one by one after the end of receiving, and with the last of them the socket.
@@ -62,10 +61,11 @@ class _Connection:
         """Receives no more; the writer leaves alone what is held."""
         with suppress(OSError):
             one = b"".join(RELEASE.pack(word) for word in words)
-            self.socket.send(one, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            self.socket.send(one, _AT_ONCE)
             self.socket.shutdown(socket.SHUT_RD)
 
-    def _let_go(self, offset: int) -> None:
+    def let_go(self, offset: int) -> None:
+        """Notes that a slab is no longer needed."""
         # Called wherever the last array of a slab ends, in whatever thread: it takes no lock and never waits.
         self._waiting.append(RELEASE.pack(offset))
         if not self.busy:
@@ -79,7 +79,7 @@ class _Connection:
             except IndexError:  # another thread was faster
                 return
             try:
-                self.socket.send(one, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+                self.socket.send(one, _AT_ONCE)
             except OSError as error:
                 if error.errno in (errno.EAGAIN, errno.ENOBUFS):  # the next one, or the next datum, tries again
                     self._waiting.append(one)
@@ -223,21 +223,26 @@ class Importer:
 
     def _receive(self, connection: _Connection) -> bool:
         """Receives until the writer or this reader ends; tells whether it is the writer that is gone."""
-        number = 0
+        number, last = 0, b""
+        receive, memory = connection.socket.recv, connection.region.size
         while True:
             try:
-                data = connection.socket.recv(MESSAGE)
+                data = receive(MESSAGE)
             except OSError:
                 data = b""
             if not data:
                 return not self._stopping.is_set()
             try:
-                event = read_event(data, connection.region.size)
+                event = read_event(data, memory)
             except ValueError as error:
                 # The numbers of what comes next cannot be trusted either: both ends begin anew.
                 self._damaged(0, error)
                 connection.end(ENDS)
                 return False
+            if event.kind == SOON:
+                if last:
+                    _rehearse(connection, last)
+                continue
             missing, number = event.number - number - 1, event.number
             if missing > 0:
                 self._counts["missed"] += missing
@@ -245,9 +250,10 @@ class Importer:
             if event.kind == SETTLE:
                 self._window.settle(event.version, event.epoch)
             else:
+                last = data
                 connection.busy = True
                 try:
-                    value = _value(connection, event)
+                    value = _value(connection.region, event, connection.let_go)
                     publish(self._window, event, value)
                     del value
                 except ValueError as error:
@@ -266,17 +272,32 @@ class Importer:
         self._window.losses.count(self._window.topic, "link_damaged", version)
 
 
-def _value(connection: _Connection, event: Event) -> Any:
+def _value(region: Region, event: Event, let_go: Callable[[int], None]) -> Any:
     """The payload of a commit: arrays are views of the writer's memory.
 
     Raises:
         ValueError: It is damaged, or of a type that is not registered.
     """
-    memories = []
-    for slab in event.slabs:  # a comprehension would be one more call
-        memories.append(connection.lease(slab))
+    lease, memories = region.lease, []
+    for offset, size in event.slabs:  # a comprehension would be one more call
+        memories.append(lease(offset, size, offset, let_go))
     body = memories[-1][: event.body_size].tobytes() if event.body_size else event.body
     return decode(body, memories)
+
+
+def _rehearse(connection: _Connection, data: bytes) -> None:
+    """Does with the last commit what is to be done with the next, to no effect.
+
+    After a pause, what that needs is no longer in the processor's caches; now it is fetched while the payload is built.
+    """
+    event = read_event(data, connection.region.size)
+    if not event.body_size:
+        with suppress(ValueError):  # the memory may hold something else by now
+            publish(connection.scratch, event, _value(connection.region, event, _let_go_of_nothing))
+
+
+def _let_go_of_nothing(offset: int) -> None:
+    """In place of telling the writer."""
 
 
 def publish(window: Window[Any], event: Event, value: Any) -> None:

@@ -46,24 +46,22 @@ class Absent:
         """
         self._config = config
         self._on_lost = on_lost
-        self._readers: dict[str, Kept] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._readers)
+        self.readers: dict[str, Kept] = {}
+        """Those who are absent, by name."""
 
     def __len__(self) -> int:
         """How many data are kept."""
-        return sum(len(kept.entries) for kept in self._readers.values())
+        return sum(len(kept.entries) for kept in self.readers.values())
 
     def leaves(self, name: str, entries: Iterable[tuple[Entry, bool]]) -> None:
         """A reader is gone: from here on all is kept for it, behind what is given."""
         if self._config.kept:
-            self._readers[name] = Kept(entries, time.monotonic() + self._config.kept_s)
+            self.readers[name] = Kept(entries, time.monotonic() + self._config.kept_s)
 
     def returns(self, name: str) -> Kept | None:
         """A reader is here: what was kept for it, if it was absent."""
         self.tidy()
-        return self._readers.pop(name, None)
+        return self.readers.pop(name, None)
 
     def most(self, size: int) -> int:
         """How many data of a size [B] are kept for a reader."""
@@ -72,26 +70,26 @@ class Absent:
     def add(self, entry: Entry, size: int) -> None:
         """Keeps a datum, of about `size` [B], for each."""
         self.tidy()
-        for kept in self._readers.values():
+        for kept in self.readers.values():
             for lost in kept.add(entry, self.most(size)):
                 self._on_lost(lost)
 
     def tidy(self) -> None:
         """Gives up those who have been absent for too long."""
         now = time.monotonic()
-        for name in [name for name, kept in self._readers.items() if now >= kept.until_s]:
+        for name in [name for name, kept in self.readers.items() if now >= kept.until_s]:
             self._give_up(name)
 
     def make_room(self) -> bool:
         """Lets go of the older half, as the memory is needed; tells whether there was any."""
         some = False
-        for kept in self._readers.values():
+        for kept in self.readers.values():
             some = some or bool(kept.entries)
             self._lose(kept, (len(kept.entries) + 1) // 2)
         return some
 
     def _give_up(self, name: str) -> None:
-        kept = self._readers.pop(name)
+        kept = self.readers.pop(name)
         self._lose(kept, len(kept.entries))
 
     def _lose(self, kept: Kept, count: int) -> None:

@@ -21,7 +21,10 @@ class NoRoom(Exception):  # noqa: N818  (it is no error: the datum is dropped an
 class Placing:
     """Says for each array of a payload in which slab it lies, and copies to one what lies in none."""
 
-    __slots__ = ("_expected", "_lease", "_pool", "copied_bytes", "copies", "leases", "slabs")
+    copies: SlabArena | None = None
+    copied_bytes = 0
+    leases: tuple[Lease, ...] = ()
+    """Of those that were taken for copies."""
 
     def __init__(self, pool: SlabPool, lease: Callable[[int], Lease | None], expected: int) -> None:
         self._pool = pool
@@ -29,17 +32,13 @@ class Placing:
         self._expected = expected
         self.slabs: list[Slab] = []
         """In the order of their numbers."""
-        self.leases: list[Lease] = []
-        """Of those that were taken for copies."""
-        self.copies: SlabArena | None = None
-        self.copied_bytes = 0
 
     def take(self, size: int) -> Lease:
         """A slab. Raises `NoRoom`."""
         found = self._lease(size)
         if found is None:
             raise NoRoom
-        self.leases.append(found)
+        self.leases += (found,)
         return found
 
     def __call__(self, array: np.ndarray) -> tuple[int, int] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import socket
 from collections import deque
+from collections.abc import Sequence
 
 from ..snapshot import Entry
 from .keeping import Kept
@@ -76,7 +77,7 @@ class Reader:
         while len(self.flight) > (self.held if in_slabs else self.most):
             self.flight.popleft()
 
-    def holds(self, slabs: list[Slab] | tuple[()]) -> None:
+    def holds(self, slabs: Sequence[Slab]) -> None:
         """Notes that it was sent a payload in slabs, each of which it will let go of once."""
         if not slabs:
             return

@@ -26,11 +26,14 @@ __all__ = [
     "MESSAGE",
     "RELEASE",
     "SETTLE",
+    "SOON",
     "Event",
     "new_event",
     "pack_event",
     "pack_greeting",
+    "read_event",
     "read_greeting",
+    "set_number",
 ]
 
 INLINE = 4096
@@ -40,16 +43,25 @@ MESSAGE = 1 << 15
 RELEASE = struct.Struct("<Q")
 LEAVES = (1 << 64) - 1
 ENDS = (1 << 64) - 2
-COMMIT, SETTLE = _KINDS = (1, 2)
+COMMIT, SETTLE, SOON = _KINDS = (1, 2, 3)
+"""The last says that a commit will probably follow; it has no number."""
 _TRIGGERS, _NEWEST, _IN_SLAB = 1, 2, 4
 _HEAD = struct.Struct("<BBHIQQQqq")
 _SLAB = struct.Struct("<QQ")
-_PROTOCOL = 1
+_NUMBER = struct.Struct("<Q")
+_HEAD_SIZE, _SLAB_SIZE, _NUMBER_AT = _HEAD.size, _SLAB.size, 8
+_pack_head, _unpack_head, _unpack_slab, _put_number = (
+    _HEAD.pack,
+    _HEAD.unpack_from,
+    _SLAB.unpack_from,
+    _NUMBER.pack_into,
+)
+_PROTOCOL = 2
 _MOST_SLABS = 256
 
 
 class Event(NamedTuple):
-    """A commit, or a settled version, on its way."""
+    """A commit, or a settled version, on its way; or the word that one is about to come."""
 
     kind: int
     number: int
@@ -72,15 +84,20 @@ class Event(NamedTuple):
 new_event = partial(tuple.__new__, Event)  # what a named tuple calls is written in Python, and takes twice as long
 
 
-def pack_event(event: Event, number: int | None = None) -> bytes:
-    """An event as bytes, under another number where one is given."""
-    kind, own, epoch, version, received, committed, triggers, newest, slabs, body, body_size = event
+def pack_event(event: Event) -> bytearray:
+    """An event as bytes, whose number `set_number` can change."""
+    kind, number, epoch, version, received, committed, triggers, newest, slabs, body, body_size = event
     flags = (_TRIGGERS if triggers else 0) | (_NEWEST if newest else 0) | (_IN_SLAB if body_size else 0)
-    number = own if number is None else number
-    data = _HEAD.pack(kind, flags, len(slabs), body_size, number, epoch, version, received, committed)
-    for offset, size in slabs:
-        data += _SLAB.pack(offset, size)
-    return data + body
+    data = bytearray(_pack_head(kind, flags, len(slabs), body_size, number, epoch, version, received, committed))
+    for slab in slabs:
+        data += _SLAB.pack(*slab)
+    data += body
+    return data
+
+
+def set_number(data: bytearray, number: int) -> None:
+    """Gives an event as bytes another number."""
+    _put_number(data, _NUMBER_AT, number)
 
 
 def read_event(data: bytes, memory: int) -> Event:
@@ -93,27 +110,28 @@ def read_event(data: bytes, memory: int) -> Event:
     Raises:
         ValueError: It is truncated, damaged, or speaks of slabs outside the memory.
     """
-    if len(data) < _HEAD.size:
-        raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD.size}")
-    kind, flags, count, body_size, number, epoch, version, received, committed = _HEAD.unpack_from(data)
+    if len(data) < _HEAD_SIZE:
+        raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD_SIZE}")
+    kind, flags, count, body_size, number, epoch, version, received, committed = _unpack_head(data)
     if kind not in _KINDS or flags >= 8 or count > _MOST_SLABS:
         raise ValueError(f"no event: kind {kind}, flags {flags}, {count} slabs")
-    end = _HEAD.size + count * _SLAB.size
+    at, end = _HEAD_SIZE, _HEAD_SIZE + count * _SLAB_SIZE
     if len(data) < end:
-        raise ValueError(f"truncated: {count} slabs expected in {len(data) - _HEAD.size} bytes")
+        raise ValueError(f"truncated: {count} slabs expected in {len(data) - _HEAD_SIZE} bytes")
     slabs: tuple[tuple[int, int], ...] = ()
-    for at in range(_HEAD.size, end, _SLAB.size):
-        slab = offset, size = _SLAB.unpack_from(data, at)
+    while at < end:
+        slab = offset, size = _unpack_slab(data, at)
         if size == 0 or offset + size > memory:
             raise ValueError(f"a slab at {offset} of {size} bytes in a memory of {memory}")
         slabs += (slab,)
+        at += _SLAB_SIZE
     if not flags & _IN_SLAB:
         body_size = 0
     elif not slabs or not 0 < body_size <= slabs[-1][1]:
         raise ValueError(f"a payload of {body_size} bytes in {slabs[-1][1] if slabs else 0} bytes of a slab")
-    triggers, newest = flags & _TRIGGERS != 0, flags & _NEWEST != 0
     # What comes over zenoh may be long, and is not to be copied.
     body = data[end:] if len(data) <= MESSAGE else memoryview(data)[end:]
+    triggers, newest = flags & _TRIGGERS != 0, flags & _NEWEST != 0
     return new_event((kind, number, epoch, version, received, committed, triggers, newest, slabs, body, body_size))
 
 

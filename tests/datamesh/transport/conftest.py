@@ -8,11 +8,14 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from warploom.dag.launch.linking import LinkPlan, Links
 from warploom.datamesh import CommitPolicy, DataMesh, Input, Output
+from warploom.datamesh.messages import message
 from warploom.datamesh.transport import SharedMemoryConfig
 
 PEER = pathlib.Path(__file__).with_name("peer.py")
@@ -27,6 +30,50 @@ def until(condition, what="it"):
     while not condition():
         assert time.monotonic() < end, f"waited {PATIENCE} s for {what() if callable(what) else what}"
         time.sleep(0.002)
+
+
+@message("test.Cloud")
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A payload of two arrays and a text."""
+
+    xyz: np.ndarray
+    intensity: np.ndarray
+    frame: str = "lidar"
+
+    @classmethod
+    def allocate(cls, array, capacity):
+        return cls(array((capacity, 3), np.float32), array(capacity, np.float32))
+
+
+@pytest.fixture
+def cloud_type():
+    return Cloud
+
+
+@pytest.fixture
+def built():
+    """What builds a cloud in place, all of whose elements are one number."""
+
+    def built(version, points=1000):
+        def build(change):
+            cloud = change.allocate(Cloud, points)
+            cloud.xyz[:], cloud.intensity[:] = version, -version
+            return cloud
+
+        return build
+
+    return built
+
+
+@pytest.fixture
+def private():
+    """Makes a cloud that is not built in place."""
+
+    def private(version, points=1000):
+        return Cloud(np.full((points, 3), version, np.float32), np.full(points, -version, np.float32))
+
+    return private
 
 
 class Side:
@@ -63,6 +110,18 @@ class Side:
             change.set_version(version)
             change.value = value(change) if callable(value) else value
             return output.commit(policy, change, **options)
+
+    def last(self, topic="topic"):
+        with self.input(topic).access() as snapshot:
+            return snapshot.last()
+
+    def shown(self, topic="topic"):
+        with self.input(topic).access() as snapshot:
+            return list(snapshot)
+
+    def until_shown(self, version, epoch=0, topic="topic"):
+        window = self.mesh.window(topic)
+        until(lambda: (s := window.snapshot()).versions[-1:] == (version,) and s.epoch == epoch, f"version {version}")
 
     def counts(self, topic):
         return self.links.counters()[topic]

@@ -1,63 +1,32 @@
 """The writer's side: payloads built in place, bounded queues, readers that come, go, hang and misbehave."""
 
+import contextlib
 import gc
 import logging
 import os
 import socket
 import threading
 import time
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from warploom.datamesh import CommitPolicy, Status
-from warploom.datamesh.messages import message
 from warploom.datamesh.transport import exporting, places
 from warploom.datamesh.transport.places import connect
-from warploom.datamesh.transport.wire import MESSAGE, RELEASE, pack_greeting, read_event, read_greeting
+from warploom.datamesh.transport.wire import (
+    COMMIT,
+    MESSAGE,
+    RELEASE,
+    SOON,
+    pack_greeting,
+    read_event,
+    read_greeting,
+)
 from warploom.errors import ConfigError
 
 
-@message("test.Cloud")
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    xyz: np.ndarray
-    intensity: np.ndarray
-    frame: str = "lidar"
-
-    @classmethod
-    def allocate(cls, array, capacity):
-        return cls(array((capacity, 3), np.float32), array(capacity, np.float32))
-
-
-def built(version, points=1000):
-    """Builds a cloud in place."""
-
-    def build(change):
-        cloud = change.allocate(Cloud, points)
-        cloud.xyz[:], cloud.intensity[:] = version, -version
-        return cloud
-
-    return build
-
-
-def private(version, points=1000):
-    """A cloud that was not built in place."""
-    return Cloud(np.full((points, 3), version, np.float32), np.full(points, -version, np.float32))
-
-
-def last(side, topic="topic"):
-    with side.input(topic).access() as snapshot:
-        return snapshot.last()
-
-
-def shown(side, topic="topic"):
-    with side.input(topic).access() as snapshot:
-        return list(snapshot)
-
-
-def test_a_payload_that_is_built_in_place_is_not_copied(linked):
+def test_a_payload_that_is_built_in_place_is_not_copied(linked, built):
     writer, reader = linked()
     arrays = []
 
@@ -68,53 +37,53 @@ def test_a_payload_that_is_built_in_place_is_not_copied(linked):
 
     assert writer.commit("topic", 1, build) is Status.OK
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert (last(reader).xyz == 1).all()
-    assert (last(reader).intensity == -1).all()
-    assert last(reader).frame == "lidar"
+    assert (reader.last().xyz == 1).all()
+    assert (reader.last().intensity == -1).all()
+    assert reader.last().frame == "lidar"
     arrays[0][0, 0] = 5  # kept from before the commit, which is wrong, and shows that it is the same memory
-    assert last(reader).xyz[0, 0] == 5
+    assert reader.last().xyz[0, 0] == 5
     assert writer.counts("topic")["copied"] == 0
     assert writer.counts("topic")["sent_bytes"] < 400
 
 
-def test_a_payload_that_is_not_is_copied_and_counted(linked):
+def test_a_payload_that_is_not_is_copied_and_counted(linked, private):
     writer, reader = linked()
     cloud = private(3)
     writer.commit("topic", 3, cloud)
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert (last(reader).xyz == 3).all()
-    assert last(writer) is cloud
+    assert (reader.last().xyz == 3).all()
+    assert writer.last() is cloud
     assert writer.counts("topic")["copied"] == 1
     assert writer.counts("topic")["copied_bytes"] == cloud.xyz.nbytes + cloud.intensity.nbytes
 
 
-def test_a_part_of_what_was_made_for_the_most_there_can_be_is_not_copied_either(linked):
+def test_a_part_of_what_was_made_for_the_most_there_can_be_is_not_copied_either(linked, built, cloud_type):
     writer, reader = linked()
     writer.commit(
         "topic",
         1,
-        lambda change: Cloud(*(array[:7] for array in vars(built(1)(change)).values() if hasattr(array, "dtype"))),
+        lambda change: cloud_type(*(array[:7] for array in vars(built(1)(change)).values() if hasattr(array, "dtype"))),
     )
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert last(reader).xyz.shape == (7, 3)
+    assert reader.last().xyz.shape == (7, 3)
     assert writer.counts("topic")["copied"] == 0
 
 
-def test_a_topic_that_is_not_exported_takes_the_same_calls(side):
+def test_a_topic_that_is_not_exported_takes_the_same_calls(side, built):
     alone = side("alone")
     assert alone.commit("own", 1, built(1)) is Status.OK
-    assert (last(alone, "own").xyz == 1).all()
+    assert (alone.last("own").xyz == 1).all()
 
 
-def test_what_is_committed_is_read_only_on_both_sides(linked):
+def test_what_is_committed_is_read_only_on_both_sides(linked, built):
     writer, reader = linked()
     writer.commit("topic", 1, built(1))
     reader.until(lambda counts: counts.get("received") == 1, "topic")
     for one in (writer, reader):
         with pytest.raises(ValueError, match="read-only"):
-            last(one).xyz[0, 0] = 2
+            one.last().xyz[0, 0] = 2
     with pytest.raises(ValueError, match="WRITEABLE"):
-        last(reader).xyz.setflags(write=True)
+        reader.last().xyz.setflags(write=True)
 
 
 def test_a_type_that_cannot_be_built_in_place_says_so(linked):
@@ -123,11 +92,11 @@ def test_a_type_that_cannot_be_built_in_place_says_so(linked):
         writer.output("topic").allocate_change().allocate(dict)
 
 
-def test_a_change_that_is_abandoned_gives_its_memory_back(linked):
+def test_a_change_that_is_abandoned_gives_its_memory_back(linked, cloud_type):
     writer, _ = linked()
 
     def fails(change):
-        change.allocate(Cloud, 100)
+        change.allocate(cloud_type, 100)
         assert writer.counts("topic")["slabs"] == 1
         raise RuntimeError("on purpose")
 
@@ -141,7 +110,7 @@ def test_small_payloads_go_with_the_message(linked):
     writer, reader = linked()
     writer.commit("topic", 1, {"speed": 12.5, "position": np.arange(3.0)})
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    value = last(reader)
+    value = reader.last()
     assert value["speed"] == 12.5
     np.testing.assert_array_equal(value["position"], np.arange(3.0))
     assert not value["position"].flags.writeable
@@ -153,7 +122,7 @@ def test_a_payload_of_many_small_things_needs_no_array(linked):
     value = {"names": [f"object {i}" for i in range(5000)]}
     writer.commit("topic", 1, value)
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert last(reader) == value
+    assert reader.last() == value
 
 
 def test_arrays_that_are_not_in_one_piece_are_copied(linked):
@@ -161,8 +130,8 @@ def test_arrays_that_are_not_in_one_piece_are_copied(linked):
     points = np.arange(8000, dtype=np.float32).reshape(-1, 4)
     writer.commit("topic", 1, [points[::2, :3], points.T])
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    np.testing.assert_array_equal(last(reader)[0], points[::2, :3])
-    np.testing.assert_array_equal(last(reader)[1], points.T)
+    np.testing.assert_array_equal(reader.last()[0], points[::2, :3])
+    np.testing.assert_array_equal(reader.last()[1], points.T)
 
 
 def test_arrays_of_a_device_arrive_as_those_of_the_host_and_their_completion_is_waited_for(linked):
@@ -187,7 +156,7 @@ def test_arrays_of_a_device_arrive_as_those_of_the_host_and_their_completion_is_
         change.completes_with(Completion())
         output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert (last(reader)["image"] == 4.0).all()
+    assert (reader.last()["image"] == 4.0).all()
     assert events == ["waited", "read"]
     assert writer.counts("topic")["copied_bytes"] == 16000
 
@@ -204,7 +173,7 @@ def test_arrays_of_warp_on_the_cpu_can_be_the_slab_itself(linked):
 
     writer.commit("topic", 1, build)
     reader.until(lambda counts: counts.get("received") == 1, "topic")
-    assert (last(reader) == 6.0).all()
+    assert (reader.last() == 6.0).all()
     assert writer.counts("topic")["copied"] == 0
 
 
@@ -241,7 +210,7 @@ def test_a_memory_that_is_full_costs_data_and_is_counted(linked):
     assert reader.counts("topic")["missed"] == 6 - reader.counts("topic")["received"]
 
 
-def test_memory_is_used_again_and_never_while_a_reader_pins_it(linked):
+def test_memory_is_used_again_and_never_while_a_reader_pins_it(linked, built):
     """Far more is sent than there is memory, while the reader keeps one snapshot."""
     writer, reader = linked(capacity=4, memory_bytes=1 << 20)
     writer.commit("topic", 1, built(1, 4000))
@@ -250,25 +219,18 @@ def test_memory_is_used_again_and_never_while_a_reader_pins_it(linked):
         for version in range(2, 200):
             writer.commit("topic", version, built(version, 4000))
             reader.until(lambda counts, version=version: counts.get("received") == version, "topic")
-            until_shown(reader, version)
-            assert (last(reader).xyz == version).all()
+            reader.until_shown(version)
+            assert (reader.last().xyz == version).all()
             assert (pinned[0].xyz == 1).all()
     assert writer.counts("topic").get("no_memory", 0) == 0
     assert writer.counts("topic").get("slow", 0) == 0
     assert writer.counts("topic")["slabs"] <= 2 * 4 + 2
 
 
-def until_shown(side, version, epoch=0):
-    end = time.monotonic() + 30
-    while (shown := side.mesh.window("topic").snapshot()).versions[-1:] != (version,) or shown.epoch != epoch:
-        assert time.monotonic() < end
-        time.sleep(0.0005)
-
-
 class TestReaders:
     """Readers that come, go, hang and misbehave."""
 
-    def test_a_reader_that_hangs_loses_data_and_the_writer_does_not_wait(self, linked):
+    def test_a_reader_that_hangs_loses_data_and_the_writer_does_not_wait(self, linked, built):
         writer, reader = linked(capacity=2, queue=3)
         hangs, go_on = threading.Event(), threading.Event()
 
@@ -290,20 +252,20 @@ class TestReaders:
             go_on.set()
         reader.until(lambda counts: counts.get("received") == 2 * 2 + 3, "topic")
         writer.commit("topic", 100, built(100))
-        until_shown(reader, 100)
+        reader.until_shown(100)
         assert reader.counts("topic")["missed"] == counts["slow"]
 
-    def test_a_new_epoch_does_not_end_what_a_reader_gets(self, linked):
+    def test_a_new_epoch_does_not_end_what_a_reader_gets(self, linked, built):
         """Its window keeps the data of the epoch before until the new one has filled it."""
         writer, reader = linked(capacity=4, queue=1)
         for epoch in range(3):
             for version in range(1, 21):
                 writer.commit("topic", version, built(version))
-                until_shown(reader, version, epoch)
+                reader.until_shown(version, epoch)
             if epoch < 2:
                 writer.mesh.window("topic").new_epoch()
         writer.commit("topic", 1, built(1), CommitPolicy.FORCE_NEW_EPOCH)
-        until_shown(reader, 1, 3)
+        reader.until_shown(1, 3)
         orders = [(epoch, version) for epoch in range(3) for version in range(1, 21)]
         assert [one[:2] for one in reader.commits["topic"]] == [*orders, (3, 1)]
         counts = writer.counts("topic")
@@ -323,8 +285,8 @@ class TestReaders:
                 return list(arrays)
 
             writer.commit("topic", version, build)
-            until_shown(reader, version)
-        assert [array[0] for array in last(reader)] == list(range(26, 31))
+            reader.until_shown(version)
+        assert [array[0] for array in reader.last()] == list(range(26, 31))
         arrays.clear()
         assert writer.counts("topic").get("slow", 0) == writer.counts("topic")["copied"] == 0
         assert writer.counts("topic")["slabs"] == 4 + 5 - 1
@@ -349,7 +311,7 @@ class TestReaders:
         finally:
             go_on.set()
 
-    def test_a_reader_whose_backlog_blocks_is_waited_for(self, side):
+    def test_a_reader_whose_backlog_blocks_is_waited_for(self, side, built):
         writer = side("writer", exports=["topic"], queue=1)
         reader = side("reader", imports=["topic"], capacity=1, queue=1, blocking=["topic"])
         writer.until(lambda counts: counts["readers"] == 1, "topic")
@@ -360,7 +322,7 @@ class TestReaders:
         assert [version for _, version, _ in reader.commits["topic"]] == list(range(1, 101))
         assert writer.counts("topic").get("slow", 0) == 0
 
-    def test_a_writer_that_waits_goes_on_when_its_reader_ends(self, side):
+    def test_a_writer_that_waits_goes_on_when_its_reader_ends(self, side, built):
         writer = side("writer", exports=["topic"], queue=1)
         with connect("node", "topic") as client:
             client.send(pack_greeting({"topic": "topic", "reader": "hangs", "capacity": 1, "blocks": True}))
@@ -375,7 +337,7 @@ class TestReaders:
         assert writer.counts("topic")["readers"] == 0
 
     @pytest.mark.parametrize("kept_s", [0.0, 0.2])
-    def test_what_a_reader_held_is_free_when_it_is_not_back_in_time(self, side, kept_s):
+    def test_what_a_reader_held_is_free_when_it_is_not_back_in_time(self, side, kept_s, built):
         writer = side("writer", exports=["topic"], capacity=1, kept_s=kept_s)
         client = connect("node", "topic")
         client.send(pack_greeting({"topic": "topic", "reader": "dies", "capacity": 8, "blocks": False}))
@@ -386,19 +348,19 @@ class TestReaders:
         client.close()
         writer.until(lambda counts: counts["readers"] == 0 and counts["slabs"] == 1, "topic")
 
-    def test_each_of_several_readers_holds_the_same_slab(self, side):
+    def test_each_of_several_readers_holds_the_same_slab(self, side, built):
         writer = side("writer", exports=["topic"], capacity=1)
         readers = [side(f"reader {n}", imports=["topic"], capacity=1) for n in range(3)]
         writer.until(lambda counts: counts["readers"] == 3, "topic")
         for version in range(1, 21):
             writer.commit("topic", version, built(version))
             for one in readers:
-                until_shown(one, version)
-        assert all((last(one).xyz == 20).all() for one in readers)
+                one.until_shown(version)
+        assert all((one.last().xyz == 20).all() for one in readers)
         gc.collect()
         writer.until(lambda counts: counts["slabs"] == 1, "topic")
 
-    def test_who_is_no_reader_is_turned_away_and_the_others_are_served(self, linked, caplog):
+    def test_who_is_no_reader_is_turned_away_and_the_others_are_served(self, linked, caplog, built):
         writer, reader = linked()
         for hello in (
             b"GET / HTTP/1.1",
@@ -415,7 +377,7 @@ class TestReaders:
         reader.until(lambda counts: counts.get("received") == 1, "topic")
         assert writer.counts("topic")["readers"] == 1
 
-    def test_a_reader_cannot_let_go_of_what_others_hold(self, linked):
+    def test_a_reader_cannot_let_go_of_what_others_hold(self, linked, built):
         writer, reader = linked()
         with connect("node", "topic") as client:
             client.settimeout(30)
@@ -424,16 +386,17 @@ class TestReaders:
             os.close(fds[0])
             assert data
             writer.commit("topic", 1, built(1))
-            event = read_event(client.recv(MESSAGE), 1 << 24)
+            while (event := read_event(client.recv(MESSAGE), 1 << 24)).kind != COMMIT:
+                assert event.kind == SOON
             ((offset, _),) = event.slabs
             for _ in range(5):
                 client.send(RELEASE.pack(offset))
             client.send(RELEASE.pack((1 << 64) - 1))
             client.send(b"x")
-            until_shown(reader, 1)
+            reader.until_shown(1)
             for version in range(2, 30):
                 writer.commit("topic", version, built(version))
-                until_shown(reader, version)
+                reader.until_shown(version)
                 with reader.input("topic").access() as snapshot:
                     assert all((cloud.xyz == v).all() for v, cloud in zip(snapshot.versions, snapshot, strict=True))
 
@@ -446,153 +409,69 @@ class TestReaders:
         assert writer.counts("topic")["readers"] == 0
 
 
-class Killed:
-    """A reader that ends without a word, as one does that is killed."""
+class TestAnnouncements:
+    """Readers are woken when a payload is begun, to be ready when it comes."""
 
-    def __init__(self, side, **options):
-        self._make = lambda: side("reader", imports=["topic"], **options)
-        self.side = self._make()
+    @pytest.fixture
+    def client(self, side):
+        """A writer, and a reader that does nothing by itself: gives the kinds of the next so many messages."""
+        with contextlib.ExitStack() as stack:
 
-    def kill(self, writer):
-        link = self.side.links._imports["topic"]
-        link._stopping.set()
-        link._socket.shutdown(socket.SHUT_RDWR)
-        writer.until(lambda counts: counts["readers"] == 0, "topic")
+            def make(capacity=8, **options):
+                writer = side("writer", exports=["topic"], **options)
+                one = stack.enter_context(connect("node", "topic"))
+                one.settimeout(30)
+                hello = {"topic": "topic", "reader": "client", "capacity": capacity, "blocks": False}
+                one.send(pack_greeting(hello))
+                os.close(socket.recv_fds(one, MESSAGE, 1)[1][0])
+                writer.until(lambda counts: counts["readers"] == 1, "topic")
+                return writer, lambda count: [read_event(one.recv(MESSAGE), 1 << 24) for _ in range(count)]
 
-    def back(self):
-        self.side = self._make()
-        return self.side
+            yield make
 
-
-class TestKilledReaders:
-    """What was committed while a reader was away is sent to it when it is back."""
-
-    def test_all_of_it_comes_in_order_and_triggers_once(self, side):
-        writer = side("writer", exports=["topic"], capacity=4, queue=2, history=2)
-        reader = Killed(side, capacity=4, queue=2)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        for version in range(1, 11):
-            writer.commit("topic", version, built(version))
-            until_shown(reader.side, version)
-        reader.kill(writer)
-        for version in range(11, 51):
-            writer.commit("topic", version, built(version))
-        back = reader.back()
-        until_shown(back, 50)
-        first = back.commits["topic"][0][1]
-        assert first <= 7, "what it may not have read comes again"
-        assert back.commits["topic"] == [(0, version, version > 10) for version in range(first, 51)]
-        assert all((cloud.xyz == v).all() for v, cloud in enumerate(shown(back), 47))
-        counts = writer.counts("topic")
-        assert counts.get("slow", 0) == counts.get("away", 0) == counts["kept"] == 0
-        writer.commit("topic", 51, built(51))
-        until_shown(back, 51)
-        assert back.commits["topic"][-1] == (0, 51, True)
-
-    def test_what_is_committed_while_it_catches_up_comes_behind(self, side):
-        writer = side("writer", exports=["topic"], capacity=2, queue=1)
-        reader = Killed(side, capacity=2, queue=1)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 31):
-            writer.commit("topic", version, built(version))
-        back = reader.back()
-        for version in range(31, 61):
-            writer.commit("topic", version, built(version))
-        until_shown(back, 60)
-        assert [version for _, version, _ in back.commits["topic"]] == list(range(1, 61))
-
-    def test_killed_while_it_catches_up_it_still_misses_nothing(self, side):
-        writer = side("writer", exports=["topic"], capacity=2, queue=1)
-        reader = Killed(side, capacity=2, queue=1)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 41):
-            writer.commit("topic", version, built(version))
-        with connect("node", "topic") as client:  # it reads some, and is killed
-            client.settimeout(30)
-            client.send(pack_greeting({"topic": "topic", "reader": "reader", "capacity": 2, "blocks": False}))
-            client.recv(MESSAGE)
-            seen = {read_event(client.recv(MESSAGE), 1 << 24).version for _ in range(3)}
-        writer.until(lambda counts: counts["readers"] == 0, "topic")
-        back = reader.back()
-        until_shown(back, 40)
-        assert seen == {1, 2, 3}
-        assert {version for _, version, _ in back.commits["topic"]} >= set(range(4, 41))
-
-    def test_too_much_is_lost_from_its_beginning_and_counted(self, side):
-        writer = side("writer", exports=["topic"], capacity=4, kept=10)
-        reader = Killed(side)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 31):
-            writer.commit("topic", version, built(version))
-        assert writer.counts("topic")["away"] == 20
-        assert writer.mesh.losses["topic", "link_away"] == 20
-        back = reader.back()
-        until_shown(back, 30)
-        assert [version for _, version, _ in back.commits["topic"]] == list(range(21, 31))
-
-    def test_its_size_is_bounded_too(self, side):
-        writer = side("writer", exports=["topic"], capacity=1, kept_bytes=5 * 12000)
-        reader = Killed(side)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 31):
-            writer.commit("topic", version, built(version, 1000))
-        assert writer.counts("topic")["kept"] <= 5
-        assert writer.counts("topic")["slabs"] <= 6
-
-    @pytest.mark.parametrize("options", [{"kept": 0}, {"kept_s": 0.0}])
-    def test_without_it_there_is_the_history(self, side, options):
-        writer = side("writer", exports=["topic"], capacity=4, history=2, **options)
-        reader = Killed(side)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 31):
-            writer.commit("topic", version, built(version))
-        back = reader.back()
-        until_shown(back, 30)
-        assert [version for _, version, _ in back.commits["topic"]] == [29, 30]
-        assert writer.counts("topic")["kept"] == 0
-
-    def test_for_who_says_good_bye_nothing_is_kept(self, side):
-        writer = side("writer", exports=["topic"])
-        reader = side("reader", imports=["topic"])
-        reader.until(lambda counts: counts["connected"], "topic")
-        reader.links.stop()
-        writer.until(lambda counts: counts["readers"] == 0, "topic")
+    def test_one_comes_before_its_commit_and_is_not_numbered(self, client, built):
+        writer, received = client()
         writer.commit("topic", 1, built(1))
-        assert writer.counts("topic")["kept"] == 0
+        soon, commit = received(2)
+        assert (soon.kind, commit.kind, commit.number) == (SOON, COMMIT, 1)
+        assert writer.counts("topic")["sent"] == 1
 
-    def test_memory_that_is_needed_is_not_kept(self, side):
-        writer = side("writer", exports=["topic"], capacity=1, memory_bytes=1 << 20, kept=1000)
-        reader = Killed(side, capacity=1, memory_bytes=1 << 20)
-        writer.until(lambda counts: counts["readers"] == 1, "topic")
-        reader.kill(writer)
-        for version in range(1, 101):
-            writer.commit("topic", version, built(version, 4000))
-        counts = writer.counts("topic")
-        assert counts["away"] > 0
-        assert counts["away"] + counts["kept"] == 100
-        assert counts["slabs"] <= 16
-        assert counts.get("no_memory", 0) == 0
-        back = reader.back()
-        until_shown(back, 100)
-        assert (last(back).xyz == 100).all()
+    def test_there_is_none_where_it_is_configured_so(self, client, built):
+        writer, received = client(announce=False)
+        writer.commit("topic", 1, built(1))
+        assert [event.kind for event in received(1)] == [COMMIT]
+
+    @pytest.mark.parametrize("never", ["_COLD_NS", "_LONG_NS"])
+    def test_there_is_none_just_after_a_commit_or_where_payloads_take_long(self, client, built, monkeypatch, never):
+        monkeypatch.setattr(exporting, "_COLD_NS", 1 << 62 if never == "_COLD_NS" else -1)
+        monkeypatch.setattr(exporting, "_LONG_NS", 0 if never == "_LONG_NS" else 1 << 62)
+        writer, received = client()
+        for version in (1, 2):
+            writer.commit("topic", version, built(version))
+        assert [event.kind for event in received(2)] == [COMMIT, COMMIT]
+
+    def test_a_reader_that_has_enough_to_read_is_not_woken(self, client, built, monkeypatch):
+        monkeypatch.setattr(exporting, "_COLD_NS", -1)
+        monkeypatch.setattr(exporting, "_LONG_NS", 1 << 62)
+        writer, received = client(capacity=1, queue=1)
+        for version in (1, 2, 3):
+            writer.commit("topic", version, built(version))
+        writer.commit("topic", 4, "small")
+        assert [event.kind for event in received(5)] == [SOON, COMMIT, SOON, COMMIT, COMMIT]
+        assert writer.counts("topic")["slow"] == 1
 
 
-def test_the_memory_of_payloads_outlives_the_export(linked):
+def test_the_memory_of_payloads_outlives_the_export(linked, built):
     writer, reader = linked()
     writer.commit("topic", 1, built(1))
-    until_shown(reader, 1)
-    cloud = last(reader)
+    reader.until_shown(1)
+    cloud = reader.last()
     writer.links.stop()
     reader.links.stop()
     assert (cloud.xyz == 1).all()
-    assert (last(writer).xyz == 1).all()
+    assert (writer.last().xyz == 1).all()
     writer.commit("topic", 2, built(2))
-    assert (last(writer).xyz == 2).all()
+    assert (writer.last().xyz == 2).all()
 
 
 def test_a_topic_has_one_exporter_in_a_node(side):
@@ -603,7 +482,7 @@ def test_a_topic_has_one_exporter_in_a_node(side):
     assert other.counts("topic")["readers"] == 0
 
 
-def test_nothing_is_left_open_after_the_stop(side, linked):
+def test_nothing_is_left_open_after_the_stop(side, linked, built):
     def descriptors():
         return sorted(
             os.readlink(f"/proc/self/fd/{fd}")
@@ -615,7 +494,7 @@ def test_nothing_is_left_open_after_the_stop(side, linked):
     before, threads = descriptors(), threading.active_count()
     writer, reader = linked()
     writer.commit("topic", 1, built(1))
-    until_shown(reader, 1)
+    reader.until_shown(1)
     for one in (reader, writer):
         one.links.stop()
         one.mesh.window("topic").new_epoch()

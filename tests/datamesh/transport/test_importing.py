@@ -11,10 +11,10 @@ import pytest
 from warploom.dag import BacklogConfig, DataProcessComponent
 from warploom.datamesh import CommitPolicy, EqualVersion, Input, Miss, Outcome, Output, Status
 from warploom.datamesh.messages import encode
-from warploom.datamesh.transport import importing
+from warploom.datamesh.transport import exporting, importing
 from warploom.datamesh.transport.places import listen
 from warploom.datamesh.transport.slabs import SlabPool
-from warploom.datamesh.transport.wire import COMMIT, MESSAGE, Event, pack_event, pack_greeting
+from warploom.datamesh.transport.wire import COMMIT, MESSAGE, SOON, Event, pack_event, pack_greeting
 
 
 def versions(side):
@@ -235,6 +235,41 @@ def impostor(node):
 
 def commit_of(number, body, slabs=(), body_size=0):
     return pack_event(Event(COMMIT, number, 0, number, 0, number, True, True, slabs, body, body_size))
+
+
+SOON_MESSAGE = pack_event(Event(SOON, 0, 0, 0, 0, 0))
+
+
+class TestRehearsals:
+    """At the word that a commit will follow, the last one is gone through again, to no effect."""
+
+    def test_they_change_and_hold_nothing(self, linked, monkeypatch):
+        values = []
+        monkeypatch.setattr(exporting, "_COLD_NS", -1)  # each payload that is begun is announced
+        monkeypatch.setattr(exporting, "_LONG_NS", 1 << 62)
+        monkeypatch.setattr(importing, "_rehearse", lambda *_, of=importing._rehearse: values.append(of(*_)))
+        writer, reader = linked(capacity=2)
+        for version in range(1, 6):
+            writer.commit("topic", version, lambda change: change.array(2000, np.int64))
+            reader.until(lambda counts, version=version: counts.get("received") == version, "topic")
+            with writer.output("topic").allocate_change() as change:  # of which nothing comes
+                change.array(2000, np.int64)
+            reader.wait(lambda version=version: len(values) >= 2 * version - 1)
+        assert reader.commits["topic"] == [(0, version, True) for version in range(1, 6)]
+        assert reader.mesh.losses["topic", "replaced"] == 0
+        writer.until(lambda counts: counts["slabs"] <= 2 + 2, "topic", "the slabs of both windows")
+
+    def test_one_that_fails_costs_nothing(self, side, impostor):
+        """What the last one refers to may hold something else by now."""
+        reader = side("reader", imports=["topic"])
+        one = impostor.accept()
+        for data in (SOON_MESSAGE, commit_of(1, TestDamage.BEYOND, ((0, 4096),)), SOON_MESSAGE, SOON_MESSAGE):
+            one.send(data)
+        one.send(commit_of(2, encode("whole")))
+        reader.until(lambda counts: counts.get("received") == 1, "topic")
+        assert versions(reader) == (0, (2,))
+        assert reader.counts("topic")["damaged"] == 1, "once"
+        assert reader.counts("topic")["connections"] == 1
 
 
 class TestDamage:

@@ -8,11 +8,13 @@ from warploom.datamesh.messages import encode
 from warploom.datamesh.transport.wire import (
     COMMIT,
     SETTLE,
+    SOON,
     Event,
     pack_event,
     pack_greeting,
     read_event,
     read_greeting,
+    set_number,
 )
 
 MEMORY = 1 << 20
@@ -23,7 +25,7 @@ SLABS = st.lists(st.tuples(st.integers(0, MEMORY - 1), st.integers(1, MEMORY)), 
 )
 EVENTS = st.builds(
     Event,
-    kind=st.sampled_from([COMMIT, SETTLE]),
+    kind=st.sampled_from([COMMIT, SETTLE, SOON]),
     number=U64,
     epoch=U64,
     version=U64,
@@ -41,6 +43,13 @@ EVENTS = st.builds(
 def test_an_event_is_read_as_it_was_sent(event):
     read = read_event(pack_event(event), MEMORY)
     assert read._replace(body=bytes(read.body)) == event
+
+
+@given(EVENTS, U64)
+def test_an_event_is_given_another_number(event, number):
+    packed = pack_event(event)
+    set_number(packed, number)
+    assert packed == pack_event(event._replace(number=number))
 
 
 @given(EVENTS.filter(lambda event: event.slabs))
