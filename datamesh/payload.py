@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from enum import Enum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -71,6 +72,10 @@ class Completion(Protocol):
         ...
 
 
+_OF_A_CLASS_STATEMENT = 1 << 9
+"""Py_TPFLAGS_HEAPTYPE: of a type's flags, the one that those written in C do not have."""
+
+
 @functools.lru_cache(maxsize=1024)
 def _kind(of: type) -> str:
     if issubclass(of, np.ndarray):
@@ -85,6 +90,8 @@ def _kind(of: type) -> str:
         return "sequence"
     if callable(getattr(of, "numpy", None)):
         return "device array"
+    if of.__dictoffset__ and of.__flags__ & _OF_A_CLASS_STATEMENT and not issubclass(of, (type, Enum)):
+        return "object"
     return "leaf"
 
 
@@ -94,14 +101,17 @@ def _parts(value: Any, kind: str) -> Iterable[Any]:
         return [getattr(value, field.name) for field in dataclasses.fields(value)]
     if kind == "mapping":
         return value.values()
+    if kind == "object":  # not what is in further objects: it may well be somebody else's
+        return [part for part in vars(value).values() if _kind(type(part)) != "object"]
     return value if kind == "sequence" else ()
 
 
 def freeze(value: Any) -> None:
     """Makes a committed payload read-only: NumPy arrays in it refuse to be written from here on.
 
-    Goes through dataclasses, mappings, lists and tuples. Arrays of Warp and torch cannot be protected: a mesh with
-    `check=True` compares their checksums.
+    Goes through dataclasses, mappings, lists and tuples, and the attributes of any other object, but not through
+    further objects among those: such a class has a method `freeze`. Arrays of Warp and torch cannot be protected: a
+    mesh with `check=True` compares their checksums.
     """
     kind = _kind(type(value))
     if kind == "leaf" or kind == "device array":

@@ -1,6 +1,7 @@
 """Freezing: what was committed cannot be written any more."""
 
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,10 @@ class Pair(NamedTuple):
     second: object
 
 
+class Color(Enum):
+    RED = 1
+
+
 class Own:
     frozen = False
 
@@ -36,6 +41,36 @@ def test_arrays_at_any_depth_refuse_writes():
             array[0] = 1.0
 
 
+class Plain:
+    """No dataclass, and without a method that freezes it."""
+
+    def __init__(self, inner=None):
+        self.xyz, self.parts, self.inner = np.zeros(3), {"a": [np.zeros(2)]}, inner
+
+
+def test_the_arrays_of_an_object_of_any_class_refuse_writes():
+    plain = Plain()
+    freeze([plain])
+    for array in (plain.xyz, plain.parts["a"][0]):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_an_object_within_an_object_is_left_alone_as_it_may_be_somebody_elses():
+    workspace, cyclic = Plain(), Plain()
+    cyclic.inner = cyclic
+    freeze(Plain(workspace))
+    freeze(cyclic)
+    workspace.xyz[0] = 1.0
+
+
+def test_a_checksum_sees_what_is_in_an_object_of_any_class():
+    plain = Plain()
+    before = checksum(plain)
+    plain.parts["a"][0][1] = 1.0
+    assert checksum(plain) != before
+
+
 def test_an_object_may_freeze_itself():
     own = Own()
     assert isinstance(own, Freezable)
@@ -43,7 +78,7 @@ def test_an_object_may_freeze_itself():
     assert own.frozen
 
 
-@pytest.mark.parametrize("value", [None, 1, "text", b"bytes", object(), Cloud, {1, 2}, [], np.float32(1.0)])
+@pytest.mark.parametrize("value", [None, 1, "text", b"bytes", object(), Cloud, {1, 2}, [], np.float32(1.0), Color.RED])
 def test_what_has_no_arrays_passes(value):
     freeze(value)
 
