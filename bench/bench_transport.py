@@ -7,30 +7,44 @@ from warploom.bench.contest import peer, record_figure
 from warploom.bench.dora_peer import send_by_dora
 from warploom.bench.transport_peers import WAYS, send_all
 
-SIZES = {"1 kB": 1_000, "100 kB": 100_000, "2 MB": 2_000_000, "20 MB": 20_000_000}
-COUNT, COUNT_OF_LONG = 150, 30
-EVERY = 4e-3  # [s] between data, so that the receiver sleeps when one comes
+SIZES = {"1 kB": 1_000, "2 MB": 2_000_000, "20 MB": 20_000_000}
 GOAL = 200.0  # [µs] of the median, whatever the size
+EVERY = 4e-3  # [s] from one to the next: the receiver sleeps, and what it needs leaves the processor's caches
+COUNT, COUNT_OF_LONG = 100, 30
+PACES = {"1 kHz": (1e-3, 200), "10 Hz": (0.1, 20)}  # [s] from one to the next, and how many
+PACED = ("warploom", "warploom, inline", "zenoh", "iceoryx2", "POSIX shared memory")
 
 
 @pytest.mark.parametrize("way", [*WAYS, "dora-rs"])
 @pytest.mark.parametrize("size", SIZES)
 def bench_transport(benchmark, monkeypatch, tmp_path, size, way):
-    """Sends data of one size by one way; the receiver sleeps in between, as between frames of a sensor.
+    """Sends data of one size by one way, each after the one before has arrived and a pause of 4 ms.
 
     Midway between two data a bare message of 64 bytes goes to a process that does nothing else: what the machine takes
     in that minute to wake a process.
     """
+    count = COUNT_OF_LONG if SIZES[size] > 2_000_000 else COUNT
+    _measure(benchmark, monkeypatch, tmp_path, way, size, EVERY, count, size)
+
+
+@pytest.mark.parametrize("way", PACED)
+@pytest.mark.parametrize("pace", PACES)
+def bench_transport_paces(benchmark, monkeypatch, tmp_path, pace, way):
+    """The same for 2 MB at other paces: a stream in which all stays in the caches, and the pace of a LiDAR."""
+    every, count = PACES[pace]
+    _measure(benchmark, monkeypatch, tmp_path, way, "2 MB", every, count, f"2 MB, {pace}")
+
+
+def _measure(benchmark, monkeypatch, tmp_path, way, size, every, count, on):
     package = "dora" if way == "dora-rs" else WAYS[way].package
     if package:
         peer(package)
     monkeypatch.setenv("WARPLOOM_RUN", str(tmp_path))
-    count = COUNT_OF_LONG if SIZES[size] > 2_000_000 else COUNT
     taken = []
-    benchmark.extra_info.update(kernel="transport", on=f"{count} of {size}")
+    benchmark.extra_info.update(kernel="transport", on=f"{count} of {on}")
 
     def send():
-        arguments = SIZES[size], count, EVERY
+        arguments = SIZES[size], count, every
         taken.append((send_by_dora(*arguments), None) if way == "dora-rs" else send_all(way, *arguments))
 
     benchmark.pedantic(send, rounds=1)
@@ -39,12 +53,15 @@ def bench_transport(benchmark, monkeypatch, tmp_path, size, way):
     goal = GOAL if way.startswith("warploom") and "zenoh" not in way else None
     note = f"best {published.min():.0f}, p99 {np.percentile(published, 99):.0f}; {len(published)} of {count} arrived"
     if bare is not None:
-        note += f"; a bare message in between {np.median(bare) / 1e3:.0f} (best {bare.min() / 1e3:.0f})"
-    name = f"{way}, {size}, commit to processor, median"
-    record_figure(benchmark, name, np.median(published), "µs", goal=goal, note=note)
+        message = np.median(bare) / 1e3
+        note += f"; {np.median(published) / message:.1f} × a bare message in between, {message:.0f}"
+        note += f" (best {bare.min() / 1e3:.0f})"
+    record_figure(
+        benchmark, f"{way}, {on}, commit to processor, median", np.median(published), "µs", goal=goal, note=note
+    )
     record_figure(
         benchmark,
-        f"{way}, {size}, with the producer's copy, median",
+        f"{way}, {on}, with the producer's copy, median",
         np.median(begun),
         "µs",
         note=f"best {begun.min():.0f}",

@@ -29,6 +29,8 @@ Times = list[tuple[int, int]]
 
 STAMPS = 2  # int64 at the beginning of the data: when they were published, when they were begun
 KEPT = 4  # data that a reader keeps
+LOST = 2_000_000_000  # [ns] after which a datum is given up
+LOOK = 2e-4  # [s] from one look whether a datum has arrived to the next
 PATIENCE = 20.0  # [s] for a child to be there
 now = time.perf_counter_ns
 
@@ -67,9 +69,15 @@ def stamped(source: np.ndarray) -> np.ndarray:
     return source
 
 
+_begun: Any = None
+"""In a child: how many data it has begun, which its parent sees."""
+
+
 def taken(data: np.ndarray) -> tuple[int, int]:
     """How long ago data were published, and begun [ns]."""
     here = now()
+    if _begun is not None:
+        _begun.value += 1
     return here - int(data[0]), here - int(data[1])
 
 
@@ -78,6 +86,7 @@ class Warploom(Way):
 
     remote: str | None = None
     hand_off: Literal["thread", "inline"] = "thread"
+    spin_us = 0.0
 
     def __init__(self, name: str, size: int, queue: Any) -> None:
         self._mesh = DataMesh(KEPT)
@@ -95,7 +104,7 @@ class Warploom(Way):
             ZenohConfig(scouting=False, listen=endpoint) if exports else ZenohConfig(scouting=False, connect=endpoint)
         )
         role = "writer" if exports else "reader"
-        shared = SharedMemoryConfig(memory_bytes=1 << 31)
+        shared = SharedMemoryConfig(memory_bytes=1 << 31, spin_us=cls.spin_us)
         plan = LinkPlan(exports, imports, remote=remote)
         links = Links(mesh, plan, node=name, name=role, shared_memory=shared, zenoh=zenoh)
         links.start()
@@ -150,6 +159,12 @@ class WarploomInline(Warploom):
     """The same to a component that runs in the thread that receives: `hand_off: inline`."""
 
     hand_off = "inline"
+
+
+class WarploomSpinning(WarploomInline):
+    """The same, where the thread that receives does not sleep: `spin_us`."""
+
+    spin_us = 1e6
 
 
 class WarploomZenoh(Warploom):
@@ -350,6 +365,7 @@ def _port(name: str) -> int:
 WAYS: dict[str, type[Way]] = {
     "warploom": Warploom,
     "warploom, inline": WarploomInline,
+    "warploom, inline, spinning": WarploomSpinning,
     "warploom over zenoh": WarploomZenoh,
     "multiprocessing.Queue": Queue,
     "zenoh": Zenoh,
@@ -360,21 +376,23 @@ WAYS: dict[str, type[Way]] = {
 """What is compared, by name."""
 
 
-def _serve(way: str, name: str, size: int, count: int, queue: Any, ready: Any, result: Any) -> None:
+def _serve(way: str, name: str, size: int, count: int, queue: Any, ready: Any, begun: Any, result: Any) -> None:
+    global _begun
+    _begun = begun
     result.send(WAYS[way].receive(name, size, count, queue, ready))
 
 
 @contextmanager
-def _child(way: str, name: str, size: int, count: int, queue: Any) -> Iterator[tuple[Any, Any]]:
-    """A process that receives; it is dead at the end."""
+def _child(way: str, name: str, size: int, count: int, queue: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """A process that receives: when it is ready, how many it has begun, its result. It is dead at the end."""
     context = multiprocessing.get_context("spawn")
-    ready = context.Event()
+    ready, begun = context.Event(), context.RawValue("q", 0)
     here, there = context.Pipe(duplex=False)
-    child = context.Process(target=_serve, args=(way, name, size, count, queue, ready, there), daemon=True)
+    child = context.Process(target=_serve, args=(way, name, size, count, queue, ready, begun, there), daemon=True)
     child.start()
     there.close()
     try:
-        yield ready, here
+        yield ready, begun, here
         child.join(5.0)  # who is killed leaves its memory behind, with some of the peers
     finally:
         child.kill()
@@ -424,7 +442,7 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
         way: Of `WAYS`.
         size: Of each [B], a multiple of 8.
         count: How many.
-        every_s: Time from one to the next, in which the receiver goes to sleep [s].
+        every_s: Time from the arrival of one to the next, in which the receiver goes to sleep [s].
 
     Returns:
         For each that came, from its publication to the start of the receiver's code, and from before it was written to
@@ -440,7 +458,7 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
     sender = None
     try:
         sender = WAYS[way](name, size, queue)
-        with _child(way, name, size, count, queue) as (ready, result):
+        with _child(way, name, size, count, queue) as (ready, begun, result):
             if not ready.wait(PATIENCE):
                 raise TimeoutError(f"{way}: the receiver is not there after {PATIENCE} s")
             for number in range(count):
@@ -448,7 +466,10 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
                 bare.send()
                 time.sleep(every_s / 2)
                 source[-1] = number
+                before, end = begun.value, now() + LOST
                 sender.send(source)
+                while begun.value == before and now() < end:  # nothing waits behind another: what one takes, unloaded
+                    time.sleep(LOOK)
             if not result.poll(PATIENCE):
                 raise TimeoutError(f"{way}: not all of {count} data of {size} bytes have arrived")
             times = result.recv()

@@ -26,6 +26,8 @@ class SharedMemoryConfig(BaseModel):
     """For how long [s]."""
     announce: bool = True
     """Whether readers are woken when a payload is begun that is built in place, so as to be ready for it."""
+    spin_us: float = Field(0.0, ge=0.0)
+    """How long a reader asks again and again for the next datum before it sleeps, with a core of its own [µs]."""
     retry_ms: float = Field(20.0, gt=0.0)
     """How long a reader waits before it looks for its producer again [ms]."""
 

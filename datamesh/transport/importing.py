@@ -11,6 +11,7 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -225,6 +226,8 @@ class Importer:
         """Receives until the writer or this reader ends; tells whether it is the writer that is gone."""
         number, last = 0, b""
         receive, memory = connection.socket.recv, connection.region.size
+        if self._config.spin_us:
+            receive = partial(_spinning, receive, round(self._config.spin_us * 1e3))
         while True:
             try:
                 data = receive(MESSAGE)
@@ -283,6 +286,17 @@ def _value(region: Region, event: Event, let_go: Callable[[int], None]) -> Any:
         memories.append(lease(offset, size, offset, let_go))
     body = memories[-1][: event.body_size].tobytes() if event.body_size else event.body
     return decode(body, memories)
+
+
+def _spinning(receive: Callable[..., bytes], spin_ns: int, size: int) -> bytes:
+    """Receives, and does not sleep for so long [ns]."""
+    end = time.perf_counter_ns() + spin_ns
+    while time.perf_counter_ns() < end:
+        try:
+            return receive(size, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            continue
+    return receive(size)
 
 
 def _rehearse(connection: _Connection, data: bytes) -> None:

@@ -237,6 +237,18 @@ def commit_of(number, body, slabs=(), body_size=0):
     return pack_event(Event(COMMIT, number, 0, number, 0, number, True, True, slabs, body, body_size))
 
 
+@pytest.mark.parametrize("spin_us", [1.0, 60e6], ids=["which then sleeps", "which does not sleep"])
+def test_a_reader_that_spins_gets_all_and_ends(linked, spin_us):
+    writer, reader = linked(spin_us=spin_us)
+    for version in range(1, 21):
+        writer.commit("topic", version, version)
+        reader.until(lambda counts, version=version: counts.get("received") == version, "topic")
+    assert [version for _, version, _ in reader.commits["topic"]] == list(range(1, 21))
+    thread = reader.links._imports["topic"]._thread
+    reader.links.stop()
+    assert not thread.is_alive()
+
+
 SOON_MESSAGE = pack_event(Event(SOON, 0, 0, 0, 0, 0))
 
 
