@@ -154,6 +154,8 @@ class DataProcessComponent(Component):
         """What it runs for now."""
         self.after_run: Callable[[Trigger], None] | None = None
         """Is told of each run that is over, before its version is settled."""
+        self.on_timing: Callable[[VertexTiming], None] | None = None
+        """Is told how long each run waited and took, as that of a vertex `process`."""
 
     @property
     def trigger_input(self) -> str | None:
@@ -357,16 +359,30 @@ class DataProcessComponent(Component):
             handle.epoch = trigger.epoch
         for name in self.trigger_inputs:
             self.inputs[name].epoch = trigger.epoch
+        status, start = Status.FAILED, self.clock.monotonic_ns()
         try:
-            self.process(trigger)
+            status = self.process(trigger)
         except BaseException:  # also SystemExit: only the process as a whole may end the thread
             self.log.exception("%s failed at version %d", self.name, trigger.version)
             self.losses.count(self.name, "failed", trigger.version)
+        if self.on_timing is not None:
+            self._tell(self.on_timing, trigger, start, status)
         if self.after_run is not None:
             self.after_run(trigger)
         self.settle(trigger.version, trigger.epoch)
         self.running = None
         self.has_run = True
+
+    def _tell(self, on_timing: Callable[[VertexTiming], None], trigger: Trigger, start: int, status: Status) -> None:
+        ready, end = start if trigger.at_ns is None else trigger.at_ns, self.clock.monotonic_ns()
+        if not isinstance(status, Status):  # one that says nothing is through
+            status = Status.OK
+        try:
+            on_timing(
+                VertexTiming(self.name, "process", trigger.version, ready, start, end, status, False, trigger.epoch)
+            )
+        except Exception:
+            self.log.exception("%s: a callback failed", self.name)
 
 
 class DagComponent(DataProcessComponent):

@@ -27,7 +27,7 @@ __all__ = ["GraphEngine", "Run", "Vertex", "VertexTiming"]
 
 
 class VertexTiming(NamedTuple):
-    """How one vertex ran for one frame; times from `time.perf_counter_ns`."""
+    """How one vertex, or a data process, ran for one frame; times from `time.perf_counter_ns`."""
 
     component: str
     vertex: str

@@ -53,7 +53,7 @@ class Process:
             external: Topics that are committed from outside the modules, with their payload types.
             offline: Every backlog blocks its producer, so that no frame is lost to a slow component; deadlines are
                 counted and change nothing.
-            on_timing: Is told of the run of every vertex.
+            on_timing: Is told of the run of every vertex, and of every data process.
             check: Payloads are compared with what they were at their commit; see `DataMesh`.
             switch_interval_s: How long a thread that computes in Python keeps others waiting, while this process runs
                 (`sys.setswitchinterval`); None leaves it as it is. Python's own 5 ms are as much as a frame's share.
@@ -257,6 +257,8 @@ class Process:
             except (ValueError, TypeError, KeyError) as error:
                 raise file.error([*keys, "config"], str(error)) from error
         if isinstance(component, DataProcessComponent):
+            if not isinstance(component, DagComponent):
+                component.on_timing = on_timing
             backlog = BacklogConfig(policy="block", depth=spec.backlog.depth) if offline else spec.backlog
             for window in (component.inputs[name].window for name in spec.trigger.inputs):
                 if backlog.policy != "latest" and backlog.depth + 2 > window.capacity:

@@ -5,7 +5,7 @@ from component_parts import BLOCK, Holding, dag, doubler, failing_at, same
 from graph_parts import Doubler
 
 from warploom.dag import BacklogConfig, DagComponent, GenericComponent, MonotonicDagComponent, Trigger
-from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, Miss, Status
+from warploom.datamesh import CommitPolicy, DataMesh, Entry, EqualVersion, ManualClock, Miss, Status
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -35,6 +35,34 @@ def test_an_exception_in_a_data_process_costs_that_frame_alone(how, topic, start
     assert mesh.losses.as_dict() == {"doubler": {"failed": 1}}
     assert "doubler failed at version 2" in caplog.text
     assert {one.name for one in caplog.records} == {"warploom.component.doubler"}
+
+
+def test_how_long_a_data_process_waited_and_ran_is_told(topic, started, caplog):
+    """By the mesh's clock, failed runs too; what is told raising costs nothing."""
+    clock = ManualClock()
+    mesh = DataMesh(clock=clock)
+    number, double = topic(mesh.window("number")), topic(mesh.window("double"))
+    component, told = doubler(mesh, ("fail", 2)), []
+    process = component.process
+
+    def takes_five(trigger):
+        clock.advance(5)
+        return process(trigger)
+
+    def tell(timing):
+        told.append(timing)
+        raise RuntimeError("whoever watches fails")
+
+    component.process, component.on_timing = takes_five, tell
+    started(component)
+    for version in (1, 2, 3):
+        number.commit(version, version)
+        double.wait_for(version)
+        clock.advance(100)
+    whole = [(t.component, t.vertex, t.version, t.ready_ns, t.start_ns, t.end_ns, t.epoch) for t in told]
+    assert whole == [("doubler", "process", n, 105 * (n - 1), 105 * (n - 1), 105 * (n - 1) + 5, 0) for n in (1, 2, 3)]
+    assert [t.status for t in told] == [Status.OK, Status.FAILED, Status.OK]
+    assert double.entries == {1: 2, 3: 6}
 
 
 def test_a_failed_frame_is_settled_through_the_whole_chain(topic, started, caplog):

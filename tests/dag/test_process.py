@@ -132,6 +132,16 @@ def cycle_many_times(process, cycles, topic):
     return measured
 
 
+def test_runs_of_vertices_and_of_data_processes_are_told(write, topic):
+    told = []
+    process = build(write(GOOD), on_timing=lambda timing: told.append(f"{timing.component}.{timing.vertex}"))
+    number = topic(process.mesh.window("sensor/number"))
+    process.start()
+    number.commit(1, 1)
+    process.stop()
+    assert sorted(told) == ["adder.add", "adder.commit", "adder.describe", "doubler.process"]
+
+
 @pytest.fixture
 def traced():
     tracemalloc.start()
