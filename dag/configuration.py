@@ -297,7 +297,8 @@ def import_class(dotted: str) -> type:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
-        hint = _closest(module_name, _modules_beside(module_name), cutoff=0.65)
+        missing = isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}.")
+        hint = _closest(module_name, _modules_beside(module_name), cutoff=0.65) if missing else ""
         way_out = f"{hint} or " if hint else ""
         raise ConfigError(f"cannot import {module_name!r}: {error}; {way_out}is its folder on PYTHONPATH?") from error
     except Exception as error:

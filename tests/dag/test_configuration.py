@@ -326,3 +326,11 @@ def test_a_class_that_cannot_be_had_is_told_with_the_reason(source, name, said, 
     with pytest.raises(ConfigError) as caught:
         import_class(name.replace("MODULE", module))
     assert said.replace("MODULE", module) in str(caught.value)
+
+
+def test_a_module_that_is_there_and_cannot_be_imported_is_not_named_as_a_way_out(tmp_path, monkeypatch):
+    (tmp_path / "imports_what_is_not_there.py").write_text("from os import not_there_at_all")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="cannot import name 'not_there_at_all'") as caught:
+        import_class("imports_what_is_not_there.Ground")
+    assert "did you mean" not in str(caught.value)
