@@ -16,7 +16,7 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
-from .parts import part_start, parts_for, run_parts
+from .parts import packed_parts, part_start, parts_for
 from .plan import capacity_for, plan_for
 from .voxel_grid import VoxelGrid, grid_of, voxel_of, write_coords
 from .voxel_order import VoxelOrder
@@ -27,7 +27,7 @@ __all__ = ["DynamicVoxelize", "DynamicVoxels", "dynamic_voxelize"]
 # Which cell a point falls into, and a sum, must not hang on whether a compiler fuses multiplications and additions.
 wp.set_module_options({"fuse_fp": False})
 
-_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
+_LEAST_PART = 250_000  # points; fewer take less time than waking a second thread
 
 
 @wp.func
@@ -46,22 +46,30 @@ def _column_of(
     const float* __restrict xyz = (const float*)xyz_in.data;
     const float* __restrict extra = extra_in.data;
     const bool four_together = columns == 4 && step == step_other && extra == xyz + 3;
+    const int* __restrict first_of = first_in.data;
+    const auto each_point = [&](const int row, const auto& add) {
+        int left = counts_in.data[row];
+        for (int run = head_in.data[row]; left > 0; run = next_in.data[run]) {
+            for (int point = first_of[run]; point < first_of[run + 1]; ++point) add((long long)point);
+            left -= first_of[run + 1] - first_of[run];
+        }
+    };
     for (int row = first; row < last; ++row) {
         const int all = counts_in.data[row];
-        const int* __restrict point = point_in.data + end_in.data[row] - all;
         float* __restrict to = means_out.data + (long long)row * columns;
         const double n = (double)all;
         if (four_together) {
             double total[4] = {};
-            for (int k = 0; k < all; ++k)
-                for (int column = 0; column < 4; ++column) total[column] += (double)xyz[step * point[k] + column];
+            each_point(row, [&](const long long point) {
+                for (int column = 0; column < 4; ++column) total[column] += (double)xyz[step * point + column];
+            });
             for (int column = 0; column < 4; ++column) to[column] = (float)(total[column] / n);
         } else
             for (int column = 0; column < columns; ++column) {
                 const float* __restrict from = column < 3 ? xyz + column : extra + column - 3;
                 const long long stride = column < 3 ? step : step_other;
                 double total = 0.0;
-                for (int k = 0; k < all; ++k) total += (double)from[stride * point[k]];
+                each_point(row, [&](const long long point) { total += (double)from[stride * point]; });
                 to[column] = (float)(total / n);
             }
         const long long cell = cell_of_row_in.data[row], rest = cell / nx;
@@ -76,8 +84,9 @@ def _average_rows(
     extra_in: wp.array2d(dtype=wp.float32),
     grid: VoxelGrid,
     counts_in: wp.array(dtype=wp.int32),
-    end_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.int32),
+    head_in: wp.array(dtype=wp.int32),
+    next_in: wp.array(dtype=wp.int32),
+    first_in: wp.array(dtype=wp.int32),
     cell_of_row_in: wp.array(dtype=wp.int64),
     first: int,
     last: int,
@@ -97,8 +106,9 @@ def _average_in_order(
     extra_in: wp.array2d(dtype=wp.float32),
     grid: VoxelGrid,
     counts_in: wp.array(dtype=wp.int32),
-    end_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.int32),
+    head_in: wp.array(dtype=wp.int32),
+    next_in: wp.array(dtype=wp.int32),
+    first_in: wp.array(dtype=wp.int32),
     cell_of_row_in: wp.array(dtype=wp.int64),
     voxels_in: wp.array(dtype=wp.int32),
     # out
@@ -107,7 +117,7 @@ def _average_in_order(
 ):
     """Means and coordinates of one of the parts that the voxels are cut into."""
     _average_rows(
-        xyz_in, extra_in, grid, counts_in, end_in, point_in, cell_of_row_in,
+        xyz_in, extra_in, grid, counts_in, head_in, next_in, first_in, cell_of_row_in,
         part_start(voxels_in[0], part, parts), part_start(voxels_in[0], part + 1, parts), coords_out, means_out,
     )  # fmt: skip
 
@@ -231,10 +241,16 @@ class DynamicVoxelize:
         buffer("means", (self.capacity, self.columns), wp.float32)
         keep("outside", wp.zeros(1, dtype=wp.int32, device=device))
         if sequential:
-            keep("_ordered", VoxelOrder(grid, self.capacity, device, self.parts))
-            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
-            keep("counts", self._ordered.counts)
-            keep("voxel_count", self._ordered.voxels[:1])
+            by_voxel = VoxelOrder(grid, self.capacity, self.outside, self.voxel_of_point, device, self.parts)
+            keep("_ordered", by_voxel)
+            keep("counts", by_voxel.counts)
+            keep("voxel_count", by_voxel.voxels[:1])
+            given = [by_voxel.counts, by_voxel.head, by_voxel.next, by_voxel.first, by_voxel.cell_of_row]
+            parts = self.parts or parts_for(self.capacity, _LEAST_PART)
+            average = packed_parts(
+                _average_in_order, parts, device, [None, None, grid, *given, by_voxel.voxels], [self.coords, self.means]
+            )
+            keep("_average", average)
         else:
             keep("_sorted", VoxelSort(grid, self.capacity, device))
             buffer("counts", self.capacity, wp.int32)
@@ -258,18 +274,8 @@ class DynamicVoxelize:
             wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self.device)
 
         if self._sequential:
-            by_voxel = self._ordered
-            by_voxel.launch(xyz, count, self.outside, self.voxel_of_point)
-            run_parts(
-                _average_in_order,
-                self._parts,
-                self.device,
-                [
-                    *(xyz, extra, self._grid, by_voxel.counts, by_voxel.end, by_voxel.point),
-                    *(by_voxel.cell_of_row, by_voxel.voxels),
-                ],
-                [self.coords, self.means],
-            )
+            self._ordered.launch(xyz, count)
+            self._average(xyz_in=xyz, extra_in=extra)
             return
         self.outside.zero_()
         if n == 0:

@@ -75,19 +75,21 @@ def run_parts(kernel: Any, parts: int, device: str, inputs: Sequence[Any], outpu
 
 
 def packed_parts(
-    kernel: Any, parts: int, device: str, inputs: Sequence[Any], outputs: Sequence[Any] = ()
+    kernel: Any, parts: int | None, device: str, inputs: Sequence[Any], outputs: Sequence[Any] = ()
 ) -> Callable[..., None]:
     """The same as a function, to be called often: on a CPU it packs the parameters once.
 
-    It takes those that change, and are None at first, by name.
+    It takes those that change, and are None at first, by name. With None for `parts` the kernel has no such
+    parameters, and is launched once.
     """
     if device == DEFAULT_DEVICE:
         return PackedLaunch(kernel, parts, inputs, outputs).launch
-    names = [argument.label for argument in kernel.adj.args[2:]]
+    own = [[]] if parts is None else [[part, parts] for part in range(parts)]
+    names = [argument.label for argument in kernel.adj.args[len(own[0]) :]]
 
     def launch(**changed: Any) -> None:
         given = [changed.get(name, value) for name, value in zip(names, [*inputs, *outputs], strict=True)]
-        for part in range(parts):
-            wp.launch(kernel, 1, inputs=[part, parts, *given], device=device)
+        for first in own:
+            wp.launch(kernel, 1, inputs=[*first, *given], device=device)
 
     return launch

@@ -1,12 +1,13 @@
 """Voxelization, hard and with fixed capacities: the first points of each voxel, as networks for point clouds want them.
 
 First come, first served: voxels are numbered by the lowest index of a point in them, and keep their first points in
-the order of the input. A CPU does just that, point after point, then writes the voxels in parts, one after the other. A
-GPU gets the same bytes from a stable sort by cell.
+the order of the input. A CPU does just that, for one run of points in a voxel after the other, then writes the voxels
+in parts, one after the other. A GPU gets the same bytes from a stable sort by cell.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,7 +18,7 @@ import warp as wp
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
-from .parts import part_start, parts_for, run_parts
+from .parts import packed_parts, part_start, parts_for
 from .plan import capacity_for, plan_for
 from .voxel_grid import VoxelGrid, grid_of, voxel_of, write_coords
 from .voxel_order import VoxelOrder
@@ -28,7 +29,7 @@ __all__ = ["Voxelize", "Voxels", "voxelize"]
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_LEAST_PART = 50_000  # points; fewer take less time than waking a second thread
+_LEAST_PART = 250_000  # points; fewer take less time than waking a second thread
 _DROPPED_POINTS, _DROPPED_VOXELS, _OUTSIDE = (wp.constant(i) for i in range(3))
 
 
@@ -58,12 +59,20 @@ def _write_features(
     const float* __restrict xyz = (const float*)xyz_in.data;
     const float* __restrict extra = extra_in.data;
     const bool four_together = columns == 4 && step == step_other && extra == xyz + 3;
-    constexpr int POINTS_AHEAD = 16, ROWS_AHEAD = 8;
-    const int listed = voxels > first ? end_in.data[(last < voxels ? last : voxels) - 1] : 0;
+    const int* __restrict first_of = first_in.data;
+    constexpr int ROWS_AHEAD = 8;
+    // The first points of a voxel, one run of them after the other.
+    const auto copy = [&](float* __restrict to, const int row, int left, const int width, const auto& copy_point) {
+        for (int run = head_in.data[row]; left > 0; run = next_in.data[run]) {
+            const int size = first_of[run + 1] - first_of[run], length = size < left ? size : left;
+            for (int k = 0; k < length; ++k, to += width) copy_point(to, (long long)(first_of[run] + k));
+            left -= length;
+        }
+    };
     for (int row = first; row < last; ++row) {
         float* __restrict to = features_out.data + (long long)row * max_points * columns;
     #ifndef __CUDA_ARCH__
-        // Rows are too far apart, and points too scattered, for the processor to see what comes next.
+        // Rows are too far apart for the processor to see what comes next.
         if (row + ROWS_AHEAD < last) {
             const int soon = filled.data ? 1 : max_points * columns;
             for (int k = 0; k < soon; k += 16) __builtin_prefetch(to + ROWS_AHEAD * max_points * columns + k, 1);
@@ -72,26 +81,21 @@ def _write_features(
         int kept = 0;
         if (row < voxels) {
             const int all = counts_in.data[row];
-            const int* __restrict point = point_in.data + end_in.data[row] - all;
             kept = all < max_points ? all : max_points;
             counts_out.data[row] = kept;
             const long long cell = cell_of_row_in.data[row], rest = cell / nx;
             coords_out.data[3 * row] = (int)(rest / ny);
             coords_out.data[3 * row + 1] = (int)(rest % ny);
             coords_out.data[3 * row + 2] = (int)(cell % nx);
-        #ifndef __CUDA_ARCH__
-            for (int k = 0; k < kept && point + k + POINTS_AHEAD < point_in.data + listed; ++k)
-                __builtin_prefetch(xyz + step * point[k + POINTS_AHEAD]);
-        #endif
             if (four_together)
-                for (int k = 0; k < kept; ++k)
-                    for (int column = 0; column < 4; ++column) to[4 * k + column] = xyz[step * point[k] + column];
+                copy(to, row, kept, 4, [&](float* __restrict to, const long long point) {
+                    for (int column = 0; column < 4; ++column) to[column] = xyz[step * point + column];
+                });
             else
-                for (int k = 0; k < kept; ++k) {
-                    for (int column = 0; column < 3; ++column) to[columns * k + column] = xyz[step * point[k] + column];
-                    for (int column = 0; column < others; ++column)
-                        to[columns * k + 3 + column] = extra[step_other * point[k] + column];
-                }
+                copy(to, row, kept, columns, [&](float* __restrict to, const long long point) {
+                    for (int column = 0; column < 3; ++column) to[column] = xyz[step * point + column];
+                    for (int column = 0; column < others; ++column) to[3 + column] = extra[step_other * point + column];
+                });
         }
         const int written = filled.data ? filled.data[row] : max_points;
         if (filled.data) filled.data[row] = kept;
@@ -104,8 +108,9 @@ def _write_rows(
     extra_in: wp.array2d(dtype=wp.float32),
     grid: VoxelGrid,
     counts_in: wp.array(dtype=wp.int32),
-    end_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.int32),
+    head_in: wp.array(dtype=wp.int32),
+    next_in: wp.array(dtype=wp.int32),
+    first_in: wp.array(dtype=wp.int32),
     cell_of_row_in: wp.array(dtype=wp.int64),
     max_points: int,
     voxels: int,
@@ -130,13 +135,14 @@ def _write_voxels(
     extra_in: wp.array2d(dtype=wp.float32),
     grid: VoxelGrid,
     counts_in: wp.array(dtype=wp.int32),
-    end_in: wp.array(dtype=wp.int32),
-    point_in: wp.array(dtype=wp.int32),
+    head_in: wp.array(dtype=wp.int32),
+    next_in: wp.array(dtype=wp.int32),
+    first_in: wp.array(dtype=wp.int32),
     cell_of_row_in: wp.array(dtype=wp.int64),
     voxels_in: wp.array(dtype=wp.int32),
     max_points: int,
     max_voxels: int,
-    # in out: points that the launch before has left in each row, or null where features are new
+    # in out: points that the launch before has left in each row, or null where nobody knows
     filled: wp.array(dtype=wp.int32),
     # out
     features_out: wp.array(dtype=wp.float32),
@@ -151,7 +157,7 @@ def _write_voxels(
     if filled:
         rows = wp.max(voxels, wp.min(voxels_in[1], max_voxels))
     _write_rows(
-        xyz_in, extra_in, grid, counts_in, end_in, point_in, cell_of_row_in, max_points, voxels,
+        xyz_in, extra_in, grid, counts_in, head_in, next_in, first_in, cell_of_row_in, max_points, voxels,
         part_start(rows, part, parts), part_start(rows, part + 1, parts),
         filled, features_out, coords_out, counts_out,
     )  # fmt: skip
@@ -207,6 +213,22 @@ def _fill_sorted(
         write_coords(voxel_of(xyz_in[point_in[j]], grid), voxel, coords_out)
     if j == last or key_in[j + 1] != key:
         counts_out[voxel] = wp.min(rank + 1, max_points)
+
+
+class _Given:
+    """Memory of features that a caller was given; once nobody holds it, it serves again: new memory costs more."""
+
+    def __init__(self, rows: int, max_points: int, columns: int):
+        self.host = np.empty((rows, max_points, columns), np.float32)
+        self.features = wp.array(self.host.reshape(-1), copy=False, device=DEFAULT_DEVICE)
+        self._own_references = self._references()
+
+    def _references(self) -> int:
+        return sys.getrefcount(self.host)
+
+    def is_free(self, rows: int) -> bool:
+        """Whether there is room for so many rows, and neither an array nor a view of it is anybody's."""
+        return rows <= len(self.host) and self._references() == self._own_references
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,13 +297,23 @@ class Voxelize:
         buffer("counts", self.max_voxels, wp.int32)
         keep("voxel_count", wp.zeros(1, dtype=wp.int32, device=device))
         keep("dropped", wp.zeros(3, dtype=wp.int32, device=device))
+        keep("_outside", self.dropped[int(_OUTSIDE) :])
         if sequential:
-            keep("_ordered", VoxelOrder(grid, self.capacity, device, self.parts))
-            keep("_parts", self.parts or parts_for(self.capacity, _LEAST_PART))
+            by_voxel = VoxelOrder(grid, self.capacity, self._outside, device=device, parts=self.parts)
+            keep("_ordered", by_voxel)
             keep("_filled", wp.zeros(self.max_voxels, dtype=wp.int32, device=device))
+            given = [by_voxel.counts, by_voxel.head, by_voxel.next, by_voxel.first, by_voxel.cell_of_row]
+            write = packed_parts(
+                _write_voxels,
+                self.parts or parts_for(self.capacity, _LEAST_PART),
+                device,
+                [None, None, grid, *given, by_voxel.voxels, self.max_points, self.max_voxels],
+                [None, None, self.coords, self.counts, self.voxel_count, self.dropped],
+            )
+            keep("_write", write)
+            keep("_given", None)
         else:
             keep("_sorted", VoxelSort(grid, self.capacity, device))
-        keep("_outside", self.dropped[int(_OUTSIDE) :])
 
     def launch(self, xyz: wp.array, count: wp.array, extra: wp.array | None = None) -> None:
         """Fills the outputs from the first `count[0]` points; allocates nothing, reads nothing back.
@@ -293,8 +325,8 @@ class Voxelize:
         """
         extra = self._checked(xyz, extra)
         if self._sequential:
-            self._ordered.launch(xyz, count, self._outside)
-            self._write(xyz, extra, self._features, self._filled)
+            self._ordered.launch(xyz, count)
+            self._write(xyz_in=xyz, extra_in=extra, filled=self._filled, features_out=self._features)
         else:
             self._launch_sort(xyz, count, extra)
 
@@ -313,27 +345,16 @@ class Voxelize:
             raise ValueError(f"extra must have shape ({n}, {self.columns - 3}), not {extra.shape}")
         return extra
 
-    def _write(self, xyz: wp.array, extra: wp.array, features: wp.array, filled: wp.array | None = None) -> None:
-        """Writes the voxels that are numbered by now: `features`, flat, and all other outputs."""
-        by_voxel = self._ordered
-        run_parts(
-            _write_voxels,
-            self._parts,
-            self.device,
-            [
-                *(xyz, extra, self._grid, by_voxel.counts, by_voxel.end, by_voxel.point, by_voxel.cell_of_row),
-                *(by_voxel.voxels, self.max_points, self.max_voxels),
-            ],
-            [filled, features, self.coords, self.counts, self.voxel_count, self.dropped],
-        )
-
-    def _launch_into_new(self, xyz: wp.array, count: wp.array, extra: wp.array) -> np.ndarray:
-        """In order: as `launch`, but the features are an array of their own, since they are too many to copy."""
-        self._ordered.launch(xyz, count, self._outside)
+    def _launch_for_caller(self, xyz: wp.array, count: wp.array, extra: wp.array) -> np.ndarray:
+        """In order: as `launch`, but the features are the caller's own, since they are too many to copy."""
+        self._ordered.launch(xyz, count)
         voxels = min(int(self._ordered.voxels.numpy()[0]), self.max_voxels)
-        host = np.empty((voxels, self.max_points, self.columns), np.float32)
-        self._write(xyz, extra, wp.array(host.reshape(-1), copy=False, device=DEFAULT_DEVICE))
-        return host
+        given = self._given
+        if given is None or not given.is_free(voxels):
+            given = _Given(min(voxels + voxels // 4 + 1, self.max_voxels), self.max_points, self.columns)
+            object.__setattr__(self, "_given", given)
+        self._write(xyz_in=xyz, extra_in=extra, filled=None, features_out=given.features)
+        return given.host[:voxels]
 
     def _launch_sort(self, xyz: wp.array, count: wp.array, extra: wp.array) -> None:
         n = xyz.shape[0]
@@ -436,7 +457,7 @@ def voxelize(
         voxels = int(plan.voxel_count.numpy()[0])
         features = give(plan.features[:voxels], borrowed.family)
     else:
-        host = plan._launch_into_new(borrowed.xyz, count, plan._checked(borrowed.xyz, borrowed.extra))
+        host = plan._launch_for_caller(borrowed.xyz, count, plan._checked(borrowed.xyz, borrowed.extra))
         voxels = len(host)
         features = adopt(host, borrowed.family)
     dropped_points, dropped_voxels, outside = (int(number) for number in plan.dropped.numpy())
