@@ -10,7 +10,7 @@ import warp as wp
 from .beams import NO_HIT, UNIFORM
 from .echoes import DROP_REACH, DROP_ZONE
 
-__all__ = ["ECHO_BLOCK", "echo_part"]
+__all__ = ["ECHO_BLOCK", "echo_part", "pack_echoes"]
 
 ECHO_BLOCK = wp.constant(256)
 """Beams of a part's turn."""
@@ -192,3 +192,70 @@ def echo_part(
             range_noise, drop_out, edge_share, pulse, noise_label, kept_out, range_out, intensity_out, label_out,
             instance_out,
         )  # fmt: skip
+
+
+@wp.func_native("""
+    const int n = beams_in.shape[0];
+    const long long offset = (long long)world * n;
+    const int* kept = kept_in.data + offset;
+    long long at = offset;
+    for (int k = 0; k < n; ++k) {
+        if (!kept[k]) continue;
+        const float range = range_in.data[offset + k];
+        const wp::vec3 beam = beams_in.data[k];
+        points_out.data[at]
+            = wp::vec4(range * beam[0], range * beam[1], range * beam[2], intensity_in.data[offset + k]);
+        ring_out.data[at] = beam_ring_in.data[k];
+        t_out.data[at] = beam_time_in.data[k];
+        point_class_out.data[at] = label_in.data[offset + k] >> 8;
+        instance_out.data[at] = instance_in.data[offset + k];
+        ++at;
+    }
+    count_out.data[world] = (int)(at - offset);
+""")
+def _pack(
+    # in
+    world: int,
+    beams_in: wp.array(dtype=wp.vec3),
+    kept_in: wp.array(dtype=wp.int32),
+    range_in: wp.array(dtype=wp.float32),
+    intensity_in: wp.array(dtype=wp.float32),
+    label_in: wp.array(dtype=wp.int32),
+    instance_in: wp.array(dtype=wp.int32),
+    beam_ring_in: wp.array(dtype=wp.uint16),
+    beam_time_in: wp.array(dtype=wp.float32),
+    # out
+    points_out: wp.array(dtype=wp.vec4),
+    ring_out: wp.array(dtype=wp.uint16),
+    t_out: wp.array(dtype=wp.float32),
+    point_class_out: wp.array(dtype=wp.int32),
+    instance_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """Writes the echoes of a world one after the other."""
+
+
+@wp.kernel
+def pack_echoes(
+    # in
+    beams_in: wp.array(dtype=wp.vec3),
+    kept_in: wp.array(dtype=wp.int32),
+    range_in: wp.array(dtype=wp.float32),
+    intensity_in: wp.array(dtype=wp.float32),
+    label_in: wp.array(dtype=wp.int32),
+    instance_in: wp.array(dtype=wp.int32),
+    beam_ring_in: wp.array(dtype=wp.uint16),
+    beam_time_in: wp.array(dtype=wp.float32),
+    # out
+    points_out: wp.array(dtype=wp.vec4),
+    ring_out: wp.array(dtype=wp.uint16),
+    t_out: wp.array(dtype=wp.float32),
+    point_class_out: wp.array(dtype=wp.int32),
+    instance_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+):
+    """As `compact_echoes`, without ranks: one world a thread."""
+    _pack(
+        wp.tid(), beams_in, kept_in, range_in, intensity_in, label_in, instance_in, beam_ring_in, beam_time_in,
+        points_out, ring_out, t_out, point_class_out, instance_out, count_out,
+    )  # fmt: skip

@@ -62,13 +62,15 @@ _TRAVERSAL = """
     const auto descend = [&](const BVH& bvh, const Packet& p, const float* best, const auto& leaf) {
         constexpr int never = 0x7f7fffff;
         uint64_t stack[DEEPEST];
-        int entries[DEEPEST], depth = 0;
+        int entries[DEEPEST], depth = 0, limit = 0;
+        bool nearer = true;  // than `limit` says: it is what the farthest hit so far is, after a leaf anew
         const int root = *bvh.root;
         if (entry(p, best, bvh_load_node(bvh.node_lowers, root), bvh_load_node(bvh.node_uppers, root)) == never) return;
         uint64_t node = bvh_query_node_load(bvh, root);
         while (true) {
             if (bvh_query_node_is_leaf(node)) {
                 leaf(bvh_query_node_lower_payload(node), bvh_query_node_upper_payload(node));
+                nearer = true;
             } else {
                 const int left = bvh_query_node_lower_payload(node), right = bvh_query_node_upper_payload(node);
                 const Corner left_low = bvh_load_node(bvh.node_lowers, left);
@@ -90,10 +92,12 @@ _TRAVERSAL = """
                     continue;
                 }
             }
-            float farthest = 0.0f;
-            for (int k = 0; k < WIDTH; ++k) farthest = best[k] > farthest ? best[k] : farthest;
-            int limit;
-            memcpy(&limit, &farthest, 4);
+            if (nearer) {
+                float farthest = 0.0f;
+                for (int k = 0; k < WIDTH; ++k) farthest = best[k] > farthest ? best[k] : farthest;
+                memcpy(&limit, &farthest, 4);
+                nearer = false;
+            }
             do {
                 if (depth == 0) return;
                 --depth;

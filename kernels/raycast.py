@@ -19,7 +19,7 @@ import warp as wp
 
 from .beams import MATERIALS, NO_HIT, first_hit, ray_of
 from .device import DEFAULT_DEVICE
-from .echo_parts import ECHO_BLOCK, echo_part
+from .echo_parts import ECHO_BLOCK, echo_part, pack_echoes
 from .echoes import compact_echoes, make_echoes
 from .interop import borrow, family_of, give
 from .meshes import MeshSet
@@ -318,23 +318,21 @@ class LidarCast:
             self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
         ]  # fmt: skip
         echoes = [self._kept, self._range, self._intensity, self._label, self._instance]
+        sensor = [self._ring, self._time]
+        points = [self.points, self.point_ring, self.point_time, self.point_class, self.point_instance, self.count]
         if self._packets:
             launch_parts(echo_part, self._parts, given, echoes)
-        else:
-            wp.launch(make_echoes, n, inputs=given, outputs=echoes, device=device)
+            wp.launch(pack_echoes, self.worlds, inputs=[self._beams, *echoes, *sensor], outputs=points, device=device)
+            return
+        wp.launch(make_echoes, n, inputs=given, outputs=echoes, device=device)
         wp.utils.array_scan(self._kept, self._rank, inclusive=False)
         wp.launch(
             compact_echoes,
-            dim=n,
-            inputs=[
-                self._beams, self._kept, self._rank, self._range, self._intensity, self._label, self._instance,
-                self._ring, self._time,
-            ],
-            outputs=[
-                self.points, self.point_ring, self.point_time, self.point_class, self.point_instance, self.count,
-            ],
+            n,
+            inputs=[self._beams, self._kept, self._rank, *echoes[1:], *sensor],
+            outputs=points,
             device=device,
-        )  # fmt: skip
+        )
 
 
 def _order_of(beams: Any) -> np.ndarray:

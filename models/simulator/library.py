@@ -104,13 +104,23 @@ def prototype(kind: str, variant: int, phase: int = 0) -> Prototype:
     return Prototype(shape, _hull(shape.vertices[shape.boxed]), high - low, _surface(shape))
 
 
+_LEAN = 0.25  # [rad] of a side of the box
+
+
 def _hull(vertices: np.ndarray) -> np.ndarray:
     """The vertices that are the farthest in any of the directions that a side of the box can face."""
-    lean = np.linspace(-0.25, 0.25, 13)  # at 0.04 rad a corner in between stands out by less than a millimetre
+    lean = np.linspace(-_LEAN, _LEAN, 13)  # at 0.04 rad a corner in between stands out by less than a millimetre
     u, v = (grid.ravel() for grid in np.meshgrid(lean, lean))
-    one = np.ones_like(u)
-    ways = np.concatenate([np.roll(np.stack([sign * one, u, v], 1), axis, 1) for axis in range(3) for sign in (1, -1)])
-    return vertices[np.unique((vertices @ ways.T).argmax(0))]
+    one, farthest = np.ones_like(u), []
+    for axis in range(3):
+        for sign in (1, -1):
+            ways = np.roll(np.stack([sign * one, u, v], 1), axis, 1)
+            # No lean brings a vertex before the first one that is farther behind it than beside it by this.
+            behind = sign * vertices[:, axis]
+            away = np.abs(vertices - vertices[behind.argmax()])
+            may = np.flatnonzero(_LEAN * (away.sum(1) - away[:, axis]) >= behind.max() - behind - 1e-9)
+            farthest.append(may[(vertices[may] @ ways.T).argmax(0)])
+    return vertices[np.unique(farthest)]
 
 
 def _surface(shape: Shape) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ START_NS = 1_700_000_000_000_000_000
 """Reference time of the first frame of a drive."""
 
 _NO_MATERIAL = 255
+_INSTANT = 1e-3  # [s] before and after a time, of the differences that stand for a velocity
 
 
 def caster(library: Library, lidar: Lidar, period: float, *, worlds: int = 1, wetness: float = 0.0) -> LidarCast:
@@ -59,10 +61,10 @@ def set_scene(
     """Places a world and aims the sensor for the sweep about time t that lasts `turn` seconds, 0 for an instant."""
     first, last = t - 0.5 * turn, t + 0.5 * turn
     mesh = np.concatenate([[world.ground_mesh], world.meshes(world.phases(t))])
-    before = world.transforms(first)
+    before, *after = world.transforms(first, last) if turn else world.transforms(first)
     motion = np.zeros((len(mesh), 4))
     if turn:
-        motion[1:] = world.motion_between(before, world.transforms(last))
+        motion[1:] = world.motion_between(before, after[0])
     cast.place(mesh, np.concatenate([np.eye(4)[None], before]), motion, world=number)
     cast.aim(pose_at(first), pose_at(last), seed, world=number)
 
@@ -84,20 +86,20 @@ def read_frame(
     n = int(cast.count.numpy()[number])
     first = number * len(cast.beams)
     own = slice(first, first + n)
-    pose, transforms, phases = pose_at(t), world.transforms(t), world.phases(t)
-    owner = cast.point_instance.numpy()[own] - 1
-    on_thing = owner >= 0
-    # Echoes of rain have no instance, those of the ground have instance 0: both belong to nothing.
-    instance = np.where(on_thing, world.ids[np.maximum(owner, 0)], -1)
+    pose, phases = pose_at(t), world.phases(t)
+    transforms, later, earlier = world.transforms(t, t + _INSTANT, t - _INSTANT)
+    velocity = (later[:, :3, 3] - earlier[:, :3, 3]) / (2 * _INSTANT)  # central differences of exact paths
+    # Echoes of rain have no instance, those of the ground have instance 0: both belong to nothing, and come first.
+    owner = cast.point_instance.numpy()[own] + 1
+    instance = np.concatenate([[-1, -1], world.ids])[owner]
     point_class = cast.point_class.numpy()[own].copy()
     times = cast.point_time.numpy()[own] - np.float32(0.5 * turn) if turn else np.zeros(n, np.float32)
     which = world.objects
     apart = np.linalg.norm(transforms[which, :2, 3] - pose[:2, 3], axis=1)
     which = which[apart < lidar.max_range]
-    counts = np.bincount(owner[on_thing], minlength=len(world))[which]
-    seen_at = np.bincount(owner[on_thing], times[on_thing], minlength=len(world))[which] / np.maximum(counts, 1)
-    velocity = world.velocity(t)
-    ahead = pose_at(t + 1e-3)[:3, 3] - pose_at(t - 1e-3)[:3, 3]
+    counts = np.bincount(owner, minlength=2 + len(world))[2 + which]
+    seen_at = np.bincount(owner, times, minlength=2 + len(world))[2 + which] / np.maximum(counts, 1)
+    ahead = pose_at(t + _INSTANT)[:3, 3] - pose_at(t - _INSTANT)[:3, 3]
     visible = None
     if visibility:
         surface = np.array([world.prototype(int(k), phases).surface for k in which]).reshape(len(which), -1, 3)
@@ -121,7 +123,7 @@ def read_frame(
         pose=pose,
         poses=np.stack([pose_at(t - 0.5 * turn), pose, pose_at(t + 0.5 * turn)]),
         pose_times=np.array([-0.5, 0.0, 0.5]) * turn,
-        speed=float(np.linalg.norm(ahead) / 2e-3),
+        speed=float(np.linalg.norm(ahead) / (2 * _INSTANT)),
         lidar=lidar.name,
     )
 
@@ -153,6 +155,7 @@ def observe(
         version: Its stamp [ns].
         visibility: Whether to tell how much of each object can be seen, which costs a few thousand rays.
     """
+    pose_at = cache(pose_at)  # begin and end are asked for twice
     set_scene(world, cast, pose_at, t, turn=turn, seed=seed)
     cast.launch()
     return read_frame(

@@ -45,21 +45,22 @@ class World:
     def __len__(self) -> int:
         return len(self.kind)
 
-    def street_pose(self, which: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def street_pose(self, which: np.ndarray, t: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """s, d and yaw against the street of things at time t."""
         gone = travelled(self.motion[which], t)
         s, d, yaw, _ = self.pose[which].T
         return s + gone * np.cos(yaw), d + gone * np.sin(yaw), yaw
 
-    def _transforms(self, which: np.ndarray, t: float) -> np.ndarray:
+    def _transforms(self, which: np.ndarray, t: float | np.ndarray) -> np.ndarray:
         s, d, yaw = self.street_pose(which, t)
         return place(self.ground, s, d, yaw, self.pose[which, 3], self.scale[which], self.upright[which])
 
-    def transforms(self, t: float) -> np.ndarray:
-        """World from local of everything at time t, shape (k, 4, 4)."""
-        transforms = self._still.copy()
+    def transforms(self, *times: float) -> np.ndarray:
+        """World from local of everything at each of some times, shape (times, k, 4, 4)."""
+        transforms = np.tile(self._still, (len(times), 1, 1, 1))
         if len(self.moves):
-            transforms[self.moves] = self._transforms(self.moves, t)
+            which, t = np.tile(self.moves, len(times)), np.repeat(times, len(self.moves))
+            transforms[:, self.moves] = self._transforms(which, t).reshape(len(times), -1, 4, 4)
         return transforms
 
     def phases(self, t: float) -> np.ndarray:
@@ -91,15 +92,6 @@ class World:
         )
         motion[moving, 3] = (yaw + np.pi) % (2 * np.pi) - np.pi
         return motion
-
-    def velocity(self, t: float) -> np.ndarray:
-        """World velocity of all things, shape (k, 3): central differences of their exact paths."""
-        h = 1e-3
-        velocity = np.zeros((len(self.kind), 3))
-        if len(self.moves):
-            after, before = self._transforms(self.moves, t + h), self._transforms(self.moves, t - h)
-            velocity[self.moves] = (after[:, :3, 3] - before[:, :3, 3]) / (2 * h)
-        return velocity
 
 
 def place(
@@ -138,7 +130,8 @@ def on_slope(
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     up = np.stack([-gx, -gy, np.ones_like(gx)], 1)
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    left = np.cross(up, forward)
+    ux, uy, uz, fx, fy, fz = *up.T, *forward.T
+    left = np.stack([uy * fz - uz * fy, uz * fx - ux * fz, ux * fy - uy * fx], 1)
     transforms = np.zeros((len(x), 4, 4))
     transforms[:, :3, :3] = np.stack([forward, left, up], 2) * scale[:, None, :]
     transforms[:, :3, 3] = np.stack([x, y, z], 1)

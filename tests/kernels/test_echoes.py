@@ -7,6 +7,7 @@ import pytest
 
 from warploom.kernels.meshes import MeshSet
 from warploom.kernels.raycast import MATERIALS, LidarCast
+from warploom.kernels.threads import set_thread_count, thread_count
 
 PLAIN, NOISE = 1, 256 * 9
 
@@ -105,3 +106,53 @@ def test_harder_rain_is_worse_and_its_measure_is_checked():
             sweep([wall(40.0, -90, 90)], directions[:3], rain=rate)
     with pytest.raises(ValueError, match="edge_share"):
         sweep([wall(40.0, -90, 90)], directions[:3], edge_share=1.5)
+
+
+@pytest.mark.parametrize("rain", [0.0, 8.0])
+def test_blocks_of_beams_give_the_bytes_of_one_beam_a_thread(rain):
+    """What a CPU does in vector instructions, against the kernel that a GPU runs, from the same hits in two worlds."""
+    random = np.random.default_rng(3)
+    meshes = MeshSet("cpu", max_faces=1000)
+    for corners in edges(40, gap=0.4):
+        meshes.add(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.array([PLAIN, PLAIN + 1]))
+    n = 3001  # no multiple of a block
+    cast = LidarCast(
+        meshes=meshes, beams=fan(n, half=1.2), ring=np.arange(n) // 700, time=np.linspace(0, 0.1, n), worlds=2,
+        min_range=0.5, reach=9.0, range_noise=0.02, drop_out=0.05, edge_share=0.7, noise_label=NOISE,
+    )  # fmt: skip
+    table = np.zeros((MATERIALS, 5), np.float32)
+    table[PLAIN], table[PLAIN + 1] = (0.6, 0.0, 0.05, 0.3, 0.02), (0.2, 0.0, 0.0, 0.0, 0.0)
+    cast.set_materials(table)
+    for world in range(2):
+        places = np.tile(np.eye(4), (len(meshes), 1, 1))
+        places[:, :3, 3] += random.normal(0, 0.2, (len(meshes), 3))
+        cast.place(np.arange(len(meshes)), places, world=world)
+        turned = np.eye(4)
+        turned[:2, :2] = [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]]
+        cast.aim(np.eye(4), turned, seed=5 + world, world=world)
+        cast.set_rain(rain, world=world)
+
+    def said():
+        cast.launch()
+        own = [slice(w * n, w * n + count) for w, count in enumerate(cast.count.numpy())]
+        arrays = (cast.points, cast.point_ring, cast.point_time, cast.point_class, cast.point_instance)
+        return [array.numpy()[part].tobytes() for part in own for array in arrays]
+
+    in_blocks = said()
+    assert all(300 < count < n for count in cast.count.numpy())
+    object.__setattr__(cast, "cast", lambda: None)  # the hits stay
+    object.__setattr__(cast, "_packets", False)
+    assert said() == in_blocks
+
+
+def test_echoes_are_the_same_in_any_number_of_parts():
+    walls, said = edges(60, gap=0.5), set()
+    before = thread_count()
+    try:
+        for threads in (1, 2, 3, 7):
+            set_thread_count(threads)
+            cast = sweep(walls, fan(), edge_share=0.6, rain=3.0, range_noise=0.02, drop_out=0.1)
+            said.add(cast.points.numpy()[: cast.count.numpy()[0]].tobytes())
+    finally:
+        set_thread_count(before)
+    assert len(said) == 1
