@@ -22,10 +22,13 @@ __all__ = [
     "invert",
     "kitti_poses",
     "points_in_boxes",
+    "quaternion",
     "rigid",
+    "rotation_vector",
     "transform_boxes",
     "transform_points",
     "transform_yaw",
+    "turned",
     "wrap_angle",
 ]
 
@@ -62,6 +65,40 @@ def invert(T: np.ndarray) -> np.ndarray:
     inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T[..., :3, 3:]
     inverse[..., 3, 3] = 1.0
     return inverse
+
+
+def quaternion(turn: np.ndarray) -> np.ndarray:
+    """The unit quaternion w x y z of a rotation matrix, shape (4,); the first that is not 0 is positive.
+
+    Of the four formulas the one by the largest part (Shepperd, "Quaternion from rotation matrix", 1978).
+    """
+    m = np.asarray(turn, np.float64)
+    x, y, z = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    xy, xz, yz = m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2]
+    a, b, c = np.diag(m)
+    # Each row is the quaternion, times four of its parts.
+    rows = np.array(
+        [[1 + a + b + c, x, y, z], [x, 1 + a - b - c, xy, xz], [y, xy, 1 - a + b - c, yz], [z, xz, yz, 1 - a - b + c]]
+    )
+    row = rows[np.diag(rows).argmax()]
+    row = row / np.linalg.norm(row)
+    return -row if row[np.flatnonzero(row)[0]] < 0 else row
+
+
+def rotation_vector(turn: np.ndarray) -> np.ndarray:
+    """Axis times angle [rad], up to π, of a rotation matrix, shape (3,)."""
+    q = quaternion(turn)
+    sine = np.linalg.norm(q[1:])
+    return q[1:] * (2.0 * np.arctan2(sine, q[0]) / sine) if sine > 0 else np.zeros(3)
+
+
+def turned(vector: np.ndarray) -> np.ndarray:
+    """The rotation matrix of an axis times an angle [rad], shape (3, 3) (Rodrigues)."""
+    x, y, z = np.asarray(vector, np.float64)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    share = np.linalg.norm((x, y, z)) / np.pi
+    # NumPy's sinc(s) is sin(πs) / πs, and 1 at 0.
+    return np.eye(3) + np.sinc(share) * cross + 0.5 * np.sinc(0.5 * share) ** 2 * cross @ cross
 
 
 def transform_points(points: np.ndarray, T: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ vehicle moves; else in the sensor's, and then velocities are relative to it.
 
 from __future__ import annotations
 
-import importlib
 from collections import Counter
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from ..kernels.track_step import TrackStep
 from ..kernels.track_table import COUNTS, PARAMETERS
-from .geometry import invert, transform_boxes
+from .geometry import invert, rotation_vector, transform_boxes, turned
 from .track_config import ClassConfig, Parameters, TrackerConfig
 
 __all__ = ["ClassConfig", "Tracker", "TrackerConfig", "Tracks"]
@@ -91,8 +90,6 @@ class Tracker:
             config: How objects move and are associated, class by class.
             device: The Warp device that the tracks live on.
         """
-        # Half a second: here and not at the first frame, nor where a configuration is only checked.
-        importlib.import_module("scipy.spatial.transform")
         self.config = config or TrackerConfig()
         self.device = device
         self.dropped: Counter[str] = Counter()
@@ -359,16 +356,12 @@ def _room(needed: int, now: int) -> int:
 
 def _motion_of(step: np.ndarray) -> np.ndarray:
     """A small rigid motion as translation and rotation vector, shape (6,)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()])
+    return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
 def _motion_to(motion: np.ndarray) -> np.ndarray:
     """The rigid motion of a translation and a rotation vector, shape (4, 4)."""
-    from scipy.spatial.transform import Rotation
-
     step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
+    step[:3, :3] = turned(motion[3:])
     step[:3, 3] = motion[:3]
     return step

@@ -18,6 +18,7 @@ import numpy as np
 
 from ...errors import SinkError
 from ...models.classes import CLASSES
+from ...models.geometry import quaternion
 from ..messages import Obstacles
 
 if TYPE_CHECKING:
@@ -288,10 +289,9 @@ def _pose(place: tuple[float, float, float], yaw: float):
 
 def _transform(stamp, frame_id: str, pose: np.ndarray | None):
     import foxglove.messages as fox
-    from scipy.spatial.transform import Rotation
 
     T = np.eye(4) if pose is None else pose
-    x, y, z, w = (float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True))
+    w, x, y, z = quaternion(T[:3, :3]).tolist()
     return fox.FrameTransform(
         timestamp=stamp,
         parent_frame_id="world",

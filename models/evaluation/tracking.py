@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ..geometry import box_overlap
 
@@ -245,6 +244,9 @@ class _Recording:
 
     def match(self, least_confidence: float | None) -> np.ndarray:
         """The row of the track for each row of the truth, −1 where it was not found."""
+        # Two thirds of a second, which a run without truth need not wait for.
+        from scipy.optimize import linear_sum_assignment
+
         match = np.full(len(self.truth.frames), -1)
         self.cost = np.zeros(len(match))
         for rows, columns, cost in self._frames:

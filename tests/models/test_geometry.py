@@ -16,9 +16,12 @@ from warploom.models.geometry import (
     invert,
     kitti_poses,
     points_in_boxes,
+    quaternion,
     rigid,
+    rotation_vector,
     transform_boxes,
     transform_points,
+    turned,
     wrap_angle,
 )
 
@@ -40,6 +43,28 @@ def test_rigid_is_scipys_rotation():
     np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("xyz", [0.3, -0.2, 2.5]).as_matrix(), atol=1e-15)
     np.testing.assert_allclose(invert(T) @ T, np.eye(4), atol=1e-15)
     np.testing.assert_allclose(invert(np.stack([T, T @ T])) @ np.stack([T, T @ T]), [np.eye(4)] * 2, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 0.3, 2.0, 3.1415, np.pi - 1e-9])
+def test_rotations_are_scipys(angle):
+    """Within rounding; half a turn away, where two vectors mean one rotation, the matrix tells."""
+    rng = np.random.default_rng(1)
+    for axis in (*np.eye(3), *-np.eye(3), *rng.normal(size=(20, 3))):
+        vector = axis / np.linalg.norm(axis) * angle
+        turn = Rotation.from_rotvec(vector)
+        np.testing.assert_allclose(turned(vector), turn.as_matrix(), atol=1e-15)
+        np.testing.assert_allclose(rotation_vector(turn.as_matrix()), vector, atol=2e-15)
+        w, x, y, z = quaternion(turn.as_matrix())
+        np.testing.assert_allclose((x, y, z, w), turn.as_quat(canonical=True), atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0.6, -0.8)])
+def test_half_a_turn(axis):
+    turn = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()
+    assert np.linalg.norm(rotation_vector(turn)) == pytest.approx(np.pi, abs=1e-12)
+    np.testing.assert_allclose(turned(rotation_vector(turn)), turn, atol=1e-12)
+    turn = np.diag(2.0 * np.square(axis) - 1) if 1 in axis else np.round(turn, 12)  # without rounding: w is 0
+    assert quaternion(turn)[np.flatnonzero(quaternion(turn))[0]] > 0
 
 
 def test_points_keep_further_columns_and_their_type():
