@@ -64,7 +64,7 @@ class Scans:
     def _simulator(self) -> Simulator:
         from ..models.simulator import Simulator
 
-        return Simulator(seed=_SEED, duration=2.0)
+        return Simulator(seed=_SEED, duration=2.0, turning=False)
 
     @functools.cached_property
     def _first_of_street(self) -> SimulatedFrame:

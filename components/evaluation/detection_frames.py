@@ -176,7 +176,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
         given = {"seed": int, "lidar": str, "duration": float, "rate": float, "mounting_height": float}
         arguments = {name: options.get(name, kind, None) for name, kind in given.items() if name in keys}
         try:
-            drive = Simulator(scenario=place, **arguments)
+            drive = Simulator(scenario=place, turning=False, **arguments)
         except ValueError as error:
             raise ConfigError(f"{uri}: {error}") from None
         steps = range(0, len(drive), options.get("every", _every, 1))

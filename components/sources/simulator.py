@@ -31,7 +31,7 @@ class SimulatorSource(Source):
             device: Where the rays are cast; None: the CPU.
             sensors: `all`, or `lidar` alone.
             options: Any of scenario, seed, duration [s], rate [Hz], lidar, mounting_height [m], rain [mm/h] and
-                turning, which is on here: sweeps take their time, as real ones do, and bring the sensor's poses.
+                turning: sweeps take their time, as real ones do, and bring the sensor's poses, unless it is off.
 
         Raises:
             ValueError: There is no such scenario or lidar, or a number makes no sense.
@@ -45,7 +45,7 @@ class SimulatorSource(Source):
         self._unscored = (PointClass.VEGETATION, PointClass.NOISE)  # as the ground score of SemanticKITTI leaves it out
         said = "&".join(f"{key}={value}" for key, value in options.items())
         self._simulator = Simulator(
-            device=device or "cpu", visibility=sensors == "all", **{"scenario": place, "turning": True} | options
+            device=device or "cpu", visibility=sensors == "all", **{"scenario": place} | options
         )
         super().__init__(f"sim:{place}" + (f"?{said}" if said else ""))
 

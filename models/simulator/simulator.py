@@ -34,7 +34,7 @@ class Simulator:
         mounting_height: float = 1.73,
         duration: float = 10.0,
         rate: float = 10.0,
-        turning: bool = False,
+        turning: bool = True,
         rain: float = 0.0,
         visibility: bool = False,
         device: str = "cpu",

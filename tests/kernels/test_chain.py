@@ -106,7 +106,7 @@ def frames():
     """Six consecutive sweeps of a simulated street, every third point."""
     from warploom.models.simulator import Simulator
 
-    return [frame.points[::3] for frame in Simulator(seed=11, duration=0.6)]
+    return [frame.points[::3] for frame in Simulator(seed=11, duration=0.6, turning=False)]
 
 
 @pytest.fixture(params=[False, True], ids=["direct", "captured"])

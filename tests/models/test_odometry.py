@@ -247,7 +247,7 @@ def street():
     """Four seconds of the simulator's drive, every other frame, of a sensor with 16 lines to be quick."""
     from warploom.models.simulator import Simulator
 
-    simulator = Simulator(seed=5, duration=4.0, lidar="vlp16")
+    simulator = Simulator(seed=5, duration=4.0, lidar="vlp16", turning=False)
     frames = [simulator.frame(k) for k in range(0, 40, 2)]
     poses = np.array([frame.pose for frame in frames])
     return [(frame.version, frame.points) for frame in frames], invert(poses[0]) @ poses

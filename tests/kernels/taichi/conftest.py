@@ -83,7 +83,7 @@ def street() -> np.ndarray:
     """A simulated sweep."""
     from warploom.models.simulator import Simulator
 
-    return Simulator(seed=3, lidar="xt32", duration=1.0).frame(0).points
+    return Simulator(seed=3, lidar="xt32", duration=1.0, turning=False).frame(0).points
 
 
 @pytest.fixture(scope="session")

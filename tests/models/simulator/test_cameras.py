@@ -11,7 +11,7 @@ WIDTH, HEIGHT = 240, 120
 
 @pytest.fixture(scope="module")
 def simulator() -> Simulator:
-    return Simulator(seed=7, lidar="vlp16", duration=1.0)
+    return Simulator(seed=7, lidar="vlp16", duration=1.0, turning=False)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ PERFECT = ImuModel(
 
 @pytest.fixture(scope="module")
 def drive() -> Simulator:
-    return Simulator(seed=11, lidar="vlp16", duration=6.0)
+    return Simulator(seed=11, lidar="vlp16", duration=6.0, turning=False)
 
 
 def test_a_perfect_imu_integrates_to_the_drive(drive):

@@ -78,7 +78,7 @@ def test_false_targets_come_at_their_rate_and_stand_on_the_ground():
 
 
 def test_a_drive_gives_the_same_targets_again():
-    simulator = Simulator(seed=7, lidar="vlp16", duration=0.5, visibility=True)
+    simulator = Simulator(seed=7, lidar="vlp16", duration=0.5, turning=False, visibility=True)
     frame = simulator.frame(2)
     one, other = (simulator.radar(frame, Radar()) for _ in range(2))
     assert one.positions.tobytes() == other.positions.tobytes()

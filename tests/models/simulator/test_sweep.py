@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
+from warploom.components.sources import open_source
 from warploom.kernels.threads import set_thread_count, thread_count
 from warploom.models.classes import VEHICLE
 from warploom.models.simulator import PointClass, Simulator, compensated, sample_scene
@@ -83,6 +84,16 @@ def test_things_that_move_are_where_they_were_at_the_time_of_their_points(frame)
         shifted += there > inside(cloud[mine], box, box[:2]) + 0.02
         assert frame.seen_at[k] == pytest.approx(t.mean(), abs=1e-5)
     assert shifted >= 1
+
+
+def test_sweeps_of_a_drive_turn_unless_told_otherwise():
+    """As those of `sim:` sources do."""
+    drive = {"seed": 3, "lidar": "vlp16", "duration": 0.1}
+    frame = Simulator(**drive).frame(0)
+    assert frame.t.any()
+    assert not Simulator(**drive, turning=False).frame(0).t.any()
+    (other,) = open_source("sim:street?seed=3&lidar=vlp16&duration=0.1&sensors=lidar")
+    assert other.points.tobytes() == frame.points.tobytes()
 
 
 def test_an_instant_sweep_has_no_times(scene):
