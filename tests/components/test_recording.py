@@ -170,7 +170,7 @@ def test_topics_and_files_that_make_no_sense_are_refused(street, tmp_path):
         list(replay_recording(tmp_path / "absent.mcap"))
 
 
-@pytest.mark.parametrize(("seek", "sweeps"), [(0.0, 10), (0.05, 10), (0.06, 9), (0.5, 5), (0.95, 1)])
+@pytest.mark.parametrize(("seek", "sweeps"), [(0.0, 10), (0.04, 10), (0.06, 9), (0.5, 5), (0.9, 1)])
 def test_a_seek_is_the_same_time_whichever_topics_are_played(street, seek, sweeps):
     """The recording begins with a camera, 0.05 s before the first sweep, and ends 0.95 s later."""
     everything = play_recording(street, rate=None, seek=seek)
