@@ -24,15 +24,12 @@ __all__ = [
     "differ",
     "find",
     "hash_cell",
-    "hash_column",
     "is_finite",
     "is_near",
     "join_levels",
-    "level_of_x",
     "radius_of",
     "touch",
     "unite",
-    "x_of_level",
 ]
 
 _LARGEST_CELL = wp.constant(wp.float64(2.0**30))
@@ -102,18 +99,6 @@ def _growth_of(level: int) -> wp.float64:
 
 
 @wp.func
-def level_of_x(x: int) -> int:
-    """The level that a cell's x carries."""
-    return (x + _HALF_LEVEL) >> _LEVEL_BITS
-
-
-@wp.func
-def x_of_level(level: int) -> int:
-    """What a cell's x is greater by for its level."""
-    return level << _LEVEL_BITS
-
-
-@wp.func
 def cell_of(point: wp.vec3, radius: Radius) -> wp.vec3i:
     """The cell of a finite point."""
     level = int(0)
@@ -158,13 +143,6 @@ def hash_cell(cell: wp.vec3i) -> int:
     )
     within = ((cell[0] & 3) << 3) | ((cell[1] & 3) << 1) | (cell[2] & 1)
     return int((((block * _SPREAD) >> wp.uint32(7)) << wp.uint32(5)) & wp.uint32(0x3FFFFFE0)) | within
-
-
-@wp.func
-def hash_column(x: int, y: int) -> int:
-    """Tiles of 512 × 512 columns are spread over the table; within one, neighbours in space share cache lines."""
-    tile = wp.uint32(x >> 9) * wp.uint32(73856093) ^ wp.uint32(y >> 9) * wp.uint32(19349669)
-    return int(((tile * _SPREAD) ^ wp.uint32((x & 511) * 512 + (y & 511))) & wp.uint32(0x3FFFFFFF))
 
 
 _NEAR = """
