@@ -3,6 +3,7 @@
 import importlib.metadata
 import pathlib
 
+import psutil
 import pytest
 
 from warploom.bench.contest import Contest
@@ -22,6 +23,7 @@ _PEERS = (
     "taichi",
 )
 _skipped: dict[str, str] = {}
+_begun = psutil.cpu_times()
 
 
 @pytest.fixture(scope="session")
@@ -53,4 +55,10 @@ def pytest_benchmark_update_json(config, benchmarks, output_json):
             machine["versions"][package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    output_json["warploom"] = {"machine": machine, "skipped": _skipped}
+    now = psutil.cpu_times()
+    stolen, idle = (
+        sum(getattr(now, name, 0.0) - getattr(_begun, name, 0.0) for name in names)
+        for names in (["steal"], ["idle", "iowait", "guest", "guest_nice"])  # a guest's time is in the user's too
+    )
+    processor_time = {"stolen_s": stolen, "wanted_s": sum(now) - sum(_begun) - idle}
+    output_json["warploom"] = {"machine": machine, "skipped": _skipped, "processor_time": processor_time}

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from .plots import draw_cost, draw_ratios
-from .results import Pair, Result, merge_measured, read_figures, read_measured, read_pairs, read_results
+from .results import Pair, Result, merge_measured, read_figures, read_measured, read_pairs, read_results, stolen_share
 
 __all__ = ["number", "render", "score_row", "share", "skipped_lines", "write_report"]
 
@@ -90,6 +90,9 @@ def _machine(measured: dict[str, Any]) -> Iterator[str]:
     memory = f", {said['memory_gib']} GiB" if said.get("memory_gib") else ""
     devices = ", ".join(device for device in said["devices"] if device != "cpu") or "none"
     yield f"- machine: {said['processor']}, {said['cores']} cores{memory}, {said['system']}; GPU: {devices}"
+    stolen = stolen_share(measured)
+    if stolen is not None and stolen >= 0.005:
+        yield f"- stolen: of the processor time that was wanted here meanwhile, the host gave {stolen:.0%} to others"
     yield f"- date: {measured['datetime'][:10]}"
     commit = measured.get("commit_info") or {}
     if commit.get("id", "unversioned") != "unversioned":

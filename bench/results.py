@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,16 @@ from typing import Any
 
 from ..errors import ConfigError
 
-__all__ = ["Pair", "Result", "merge_measured", "read_figures", "read_measured", "read_pairs", "read_results"]
+__all__ = [
+    "Pair",
+    "Result",
+    "merge_measured",
+    "read_figures",
+    "read_measured",
+    "read_pairs",
+    "read_results",
+    "stolen_share",
+]
 
 _OURS, _PLAN, _ONE_THREAD = "warploom", "warploom plan", "warploom, 1 thread"
 
@@ -120,11 +130,20 @@ def merge_measured(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         runs: As `read_measured` gives them, at least one; machine, date and commit are those of the first.
     """
     skipped = {name: reason for run in runs for name, reason in run["warploom"].get("skipped", {}).items()}
+    spent: Counter[str] = Counter()
+    for run in runs:
+        spent.update(run["warploom"].get("processor_time", {}))
     return {
         **runs[0],
         "benchmarks": [entry for run in runs for entry in run["benchmarks"]],
-        "warploom": {**runs[0]["warploom"], "skipped": skipped},
+        "warploom": {**runs[0]["warploom"], "skipped": skipped, "processor_time": dict(spent)},
     }
+
+
+def stolen_share(measured: dict[str, Any]) -> float | None:
+    """Which part of the time for which a virtual machine's processors had work they were not given; None: not known."""
+    spent = measured["warploom"].get("processor_time", {})
+    return spent["stolen_s"] / spent["wanted_s"] if spent.get("wanted_s") else None
 
 
 def read_results(measured: dict[str, Any]) -> list[Result]:

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from warploom.bench.report import render, write_report
-from warploom.bench.results import read_results
+from warploom.bench.results import merge_measured, read_results
 
 
 @pytest.fixture
@@ -55,6 +55,16 @@ def test_the_summary_has_what_has_a_goal(report_of, entry):
     summary = row(text, "cluster", "Goals")
     assert [summary[name] for name in ("ratio", "goal", "reached", "accuracy")] == ["1/83.3", "≤ 1/80", "yes", "exact"]
     assert "open3d" not in text.partition("## Goals")[2].partition("## ")[0]
+
+
+def test_what_the_host_gave_to_others_is_told_over_all_files(run_of, entry):
+    runs = [run_of(entry("warploom", 0.003)) for _ in range(3)]
+    assert "stolen" not in render(merge_measured(runs))
+    for run, stolen in zip(runs, (1.0, 29.0), strict=False):  # the third is of a machine that does not tell
+        run["warploom"]["processor_time"] = {"stolen_s": stolen, "wanted_s": 50.0}
+    assert "- stolen: of the processor time that was wanted here meanwhile, the host gave 30% to others" in render(
+        merge_measured(runs)
+    )
 
 
 def test_one_thread_has_a_column_where_it_was_timed(report_of, entry):
