@@ -13,7 +13,7 @@ demo: $(VENV)/.base
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-# The long versions of tests: kills by the hundred.
+# The long versions of tests: kills by the hundred, soaks, ten thousand starts and stops.
 campaign: $(VENV)/.dev
 	$(BIN)/python -m pytest -m campaign
 

@@ -82,7 +82,7 @@ def test_every_frame_of_eight_threads_ends_once_and_every_loss_is_counted(backlo
     check(topic, 0.5, 1, backlog, hand_off)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize(("backlog", "hand_off"), CASES)
 def test_the_same_for_a_minute_in_all(backlog, hand_off, topic, caplog):
     caplog.set_level("CRITICAL")

@@ -158,7 +158,7 @@ def test_three_hundred_starts_and_stops_of_a_process_leave_nothing_behind(write,
     assert len(Plain.events) == 600
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_ten_thousand_starts_and_stops_of_a_process_leave_nothing_behind(write, topic, traced, monkeypatch):
     monkeypatch.setattr(Plain, "events", deque(maxlen=4))
     process = build(write(GOOD), offline=True)

@@ -352,7 +352,7 @@ def test_eight_threads_commit_and_read_without_a_torn_snapshot():
     assert commits == 8 * 150 == kept + counted
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_eight_threads_commit_and_read_for_a_minute():
     problems, commits, kept, counted = commit_and_read(60.0, seed=2)
     assert not problems
