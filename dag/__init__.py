@@ -8,6 +8,7 @@ from .deadline import DeadlineConfig
 from .drawing import draw_mermaid, draw_text
 from .engine import GraphEngine, Run, Vertex, VertexTiming
 from .flags import YamlFlags
+from .garbage import frozen_heap
 from .modules import load_module
 from .process import Process
 from .processor import In, Out, Processor, ProcessorConfig, ProcessorHarness
@@ -51,6 +52,7 @@ __all__ = [
     "draw_svg",
     "draw_text",
     "find_config",
+    "frozen_heap",
     "import_class",
     "load_module",
     "nearest",

@@ -1,21 +1,25 @@
-"""Counters and histograms of a run: commits, losses, runs of vertices, waits, and the latency of topics."""
+"""Counters and histograms of a run: commits, losses, runs of vertices, waits, latency of topics, pauses."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections import Counter
+import weakref
+from collections import Counter, deque
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from ..datamesh import DataMesh, Entry, LossCounters, Status
 from .engine import VertexTiming
+from .garbage import GarbagePause, on_pause
 
 __all__ = ["Histogram", "Metrics"]
 
 _GROWTH = math.log(1.04)
 _SMALLEST = 1e-3  # [ms]: whatever is below falls into the first bucket
+_PAUSES = 4096  # passes of the collector that may wait to be taken up: minutes of them
 _BOUNDS = (0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 250.0, 500.0, 1000.0, 2500.0)
 """Upper bounds of the buckets that a Prometheus server is given [ms]."""
 
@@ -88,10 +92,17 @@ class Metrics:
         """In the queue, by vertex [ms]."""
         self.run: dict[str, Histogram] = {}
         """In the processor, by vertex [ms]."""
+        self.pauses: dict[int, Histogram] = {generation: Histogram() for generation in range(3)}
+        """Of all threads while the garbage collector passed, by its generation [ms]."""
+        # A pass comes in the midst of anything, also of what holds a lock: it only leaves its pause here.
+        self._paused: deque[GarbagePause] = deque(maxlen=_PAUSES)
+        self._ends_pauses: weakref.finalize[..., Metrics] | None = None
 
     def watch(self, mesh: DataMesh, topics: Iterable[str]) -> None:
-        """Counts the commits of some topics and takes their latency; and the losses of the mesh."""
+        """Counts the commits of some topics and takes their latency; the losses of the mesh; the collector's pauses."""
         self._losses = mesh.losses
+        if self._ends_pauses is None:
+            self._ends_pauses = weakref.finalize(self, on_pause(self._paused.append))
         for topic in topics:
             self.latency[topic] = Histogram()
             mesh.window(topic).subscribe(partial(self._on_commit, topic), partial(self._on_settle, topic))
@@ -113,6 +124,14 @@ class Metrics:
             self._runs[component, vertex, status] += 1
         histograms[0].observe((start - ready) / 1e6)
         histograms[1].observe((end - start) / 1e6)
+        if self._paused:
+            self._take_pauses()
+
+    def _take_pauses(self) -> None:
+        with suppress(IndexError):  # empty: another thread may take them as well
+            while True:
+                pause = self._paused.popleft()
+                self.pauses[pause.generation].observe(pause.ms)
 
     def _add(self, component: str, vertex: str) -> tuple[Histogram, Histogram]:
         with self._lock:
@@ -131,6 +150,7 @@ class Metrics:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it as plain values."""
+        self._take_pauses()
         runs: dict[str, dict[str, int]] = {}
         for vertex, status, count in self.runs():
             runs.setdefault(vertex, {})[status] = count
@@ -144,10 +164,12 @@ class Metrics:
             "runs": runs,
             "wait_ms": {vertex: self.wait[vertex].as_dict() for vertex in vertices},
             "run_ms": {vertex: self.run[vertex].as_dict() for vertex in vertices},
+            "gc_pause_ms": {f"generation {number}": pauses.as_dict() for number, pauses in self.pauses.items()},
         }
 
     def prometheus(self) -> str:
         """All of it in Prometheus' text format."""
+        self._take_pauses()
         with self._lock:
             commits = sorted(self.commits.items())
             latency, wait, run = (sorted(some.items()) for some in (self.latency, self.wait, self.run))
@@ -164,6 +186,8 @@ class Metrics:
         lines += _histogram("warploom_latency_milliseconds", "topic", latency)
         lines += _histogram("warploom_vertex_wait_milliseconds", "vertex", wait)
         lines += _histogram("warploom_vertex_run_milliseconds", "vertex", run)
+        pauses = [(str(generation), histogram) for generation, histogram in self.pauses.items()]
+        lines += _histogram("warploom_gc_pause_milliseconds", "generation", pauses)
         return "\n".join(lines) + "\n"
 
 

@@ -15,6 +15,7 @@ from .component import Component, DagComponent, DataProcessComponent, GenericCom
 from .configuration import ConfigFile, import_class, nearest
 from .engine import VertexTiming
 from .flags import load_flags
+from .garbage import FrozenHeap
 from .graph import DeclaredVertex, check_payloads, declare_vertices, graph_payloads, type_name
 from .schema import ComponentSpec, ModuleSpec
 
@@ -42,6 +43,7 @@ class Process:
         on_timing: Callable[[VertexTiming], None] | None = None,
         check: bool = False,
         switch_interval_s: float | None = 100e-6,
+        freeze: bool = True,
         prepare: bool = True,
     ) -> None:
         """Builds, checks and initialises all components.
@@ -57,6 +59,8 @@ class Process:
             check: Payloads are compared with what they were at their commit; see `DataMesh`.
             switch_interval_s: How long a thread that computes in Python keeps others waiting, while this process runs
                 (`sys.setswitchinterval`); None leaves it as it is. Python's own 5 ms are as much as a frame's share.
+            freeze: Keep the garbage collector from all that is there when it starts, until it stops: a full pass would
+                hold every thread up for 0.1 s; see `frozen_heap`.
             prepare: False only validates: nothing is initialised, so no kernel is compiled and no model loaded, and
                 what was made cannot be started.
 
@@ -68,6 +72,7 @@ class Process:
         self.components: dict[str, Component] = {}
         self._started: list[Component] = []
         self._switching = _SwitchInterval(switch_interval_s)
+        self._heap = FrozenHeap() if freeze else None
         places = [(file, index) for file in modules for index in range(len(file.content.components))]
         built = [self._declare(place, context) for place in places]
         self._check_topics(places, external or {})
@@ -290,6 +295,8 @@ class Process:
                 self.stop()
                 raise
             self._started.append(component)
+        if self._heap is not None:  # last, as what starts again also initialises again
+            self._heap.hold()
 
     def stop(self) -> None:
         """Stops the components, those that produce first, each after it has finished what waits for it."""
@@ -299,6 +306,8 @@ class Process:
                 component.stop()
             except Exception:  # the others must stop all the same
                 _log.exception("%s failed to stop", component.name)
+        if self._heap is not None:
+            self._heap.release()
         self._switching.release()
 
     def _consumers_first(self) -> Iterable[Component]:

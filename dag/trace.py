@@ -2,7 +2,8 @@
 
 Every thread has its row, on it a slice for each run of a vertex, and a short one for each commit of a source; arrows
 join what ran for one version; rows of their own show how long vertices waited in their queues; lines show latency,
-frames on their way and losses. A trace that breaks off can be opened all the same.
+frames on their way and losses. Passes of Python's garbage collector are slices where they happened. A trace that breaks
+off can be opened all the same.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any, Self
 from ..datamesh import DataMesh, Entry
 from ..errors import SinkError
 from .engine import VertexTiming
+from .garbage import GarbagePause, on_pause
 
 __all__ = ["Trace"]
 
@@ -70,6 +72,7 @@ class Trace:
             self._file.write("[\n" + json.dumps(head))
         except OSError as error:
             raise SinkError(f"{self.path}: cannot be created: {error.strerror or error}") from None
+        self._unsubscribe.append(on_pause(self._on_pause))
         self._thread = threading.Thread(target=self._run, name="trace", daemon=True)
         self._thread.start()
 
@@ -103,16 +106,23 @@ class Trace:
     def _on_loss(self, mesh: DataMesh, place: str, reason: str, version: int) -> None:
         self._add("loss", mesh.clock.monotonic_ns(), place, reason, version)
 
+    def _on_pause(self, pause: GarbagePause) -> None:
+        # In the midst of anything: without the thread's name, which a thread that just begins must be asked for.
+        self._append((threading.get_ident(), "pause", pause))
+
     def _add(self, *event: Any) -> None:
         thread = threading.get_ident()
         name = threading.current_thread().name
         if self._threads.get(thread) != name:  # the number of a thread that ended is given to another
             self._threads[thread] = name
             self._events.append((thread, "thread", name))
+        self._append((thread, *event))
+
+    def _append(self, event: tuple[Any, ...]) -> None:
         if self.failure is not None or self._closing.is_set() or len(self._events) > _MOST:
             self.dropped += 1
         else:
-            self._events.append((thread, *event))
+            self._events.append(event)
 
     def _run(self) -> None:
         while not self._closing.wait(_FLUSH):
@@ -139,6 +149,8 @@ class Trace:
             yield {"name": "thread_name", "ph": "M", **here, "args": {"name": event[0]}}
         elif kind == "run":
             yield from self._of_run(event[0], here)
+        elif kind == "pause":
+            yield _of_pause(event[0], here)
         elif kind == "commit":
             yield from self._of_commit(*event, here=here)
         elif kind == "settle":
@@ -236,3 +248,9 @@ class Trace:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _of_pause(pause: GarbagePause, here: dict[str, Any]) -> dict[str, Any]:
+    name, start = f"garbage collection, generation {pause.generation}", pause.start_ns / 1e3
+    took = (pause.end_ns - pause.start_ns) / 1e3
+    return {"name": name, "cat": "gc", "ph": "X", "ts": start, "dur": took, **here, "args": {"freed": pause.collected}}
