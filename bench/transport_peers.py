@@ -86,7 +86,7 @@ class Warploom(Way):
 
     remote: str | None = None
     hand_off: Literal["thread", "inline"] = "thread"
-    spin_us = 0.0
+    spin_us = 1000.0
 
     def __init__(self, name: str, size: int, queue: Any) -> None:
         self._mesh = DataMesh(KEPT)
@@ -161,10 +161,10 @@ class WarploomInline(Warploom):
     hand_off = "inline"
 
 
-class WarploomSpinning(WarploomInline):
-    """The same, where the thread that receives does not sleep: `spin_us`."""
+class WarploomSleeping(WarploomInline):
+    """The same, where the thread that receives sleeps until a datum is there: `spin_us: 0`."""
 
-    spin_us = 1e6
+    spin_us = 0.0
 
 
 class WarploomZenoh(Warploom):
@@ -365,7 +365,7 @@ def _port(name: str) -> int:
 WAYS: dict[str, type[Way]] = {
     "warploom": Warploom,
     "warploom, inline": WarploomInline,
-    "warploom, inline, spinning": WarploomSpinning,
+    "warploom, inline, sleeping": WarploomSleeping,
     "warploom over zenoh": WarploomZenoh,
     "multiprocessing.Queue": Queue,
     "zenoh": Zenoh,

@@ -16,6 +16,7 @@ from ..configuration import ConfigFile, import_class, nearest
 from ..graph import check_payloads, declare_vertices, graph_payloads, type_name
 from ..process import Process
 from ..schema import ComponentSpec, ModuleSpec
+from .rehearsing import rehearsal
 
 __all__ = ["LinkPlan", "Links", "plan_links"]
 
@@ -268,7 +269,9 @@ class Links:
                 link = ZenohImporter(self._session_of_zenoh(), window)
             else:
                 blocks = topic in self._plan.blocking
-                link = Importer(window, node=self._node, name=self._name, config=self._shared, blocks=blocks)
+                link = Importer(
+                    window, node=self._node, name=self._name, config=self._shared, blocks=blocks, rehearsal=rehearsal
+                )
                 link.start()
             self._imports[topic] = link
 

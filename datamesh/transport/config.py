@@ -26,8 +26,10 @@ class SharedMemoryConfig(BaseModel):
     """For how long [s]."""
     announce: bool = True
     """Whether readers are woken when a payload is begun that is built in place, so as to be ready for it."""
-    spin_us: float = Field(0.0, ge=0.0)
-    """How long a reader asks again and again for the next datum before it sleeps, with a core of its own [µs]."""
+    spin_us: float = Field(1000.0, ge=0.0)
+    """For how long a reader stays awake, at most, for a datum that is announced and due; 0: it sleeps [µs]."""
+    spin_share: float = Field(0.1, ge=0.0, le=1.0)
+    """Of a core, how much that may take."""
     retry_ms: float = Field(20.0, gt=0.0)
     """How long a reader waits before it looks for its producer again [ms]."""
 

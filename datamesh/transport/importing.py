@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import select
 import socket
 import threading
 import time
@@ -24,9 +25,22 @@ from ..policy import CommitPolicy, EqualVersion
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
+from .expecting import Expectation
 from .places import connect, peer_of
 from .slabs import Region
-from .wire import ENDS, LEAVES, MESSAGE, RELEASE, SETTLE, SOON, Event, pack_greeting, read_event, read_greeting
+from .wire import (
+    ENDS,
+    LEAVES,
+    MESSAGE,
+    RELEASE,
+    SETTLE,
+    SOON,
+    Event,
+    pack_greeting,
+    read_event,
+    read_greeting,
+    read_soon,
+)
 
 __all__ = ["Importer", "publish"]
 
@@ -35,7 +49,18 @@ _log = logging.getLogger(__name__)
 # Members of enums take longer to look up than to compare.
 _OVERWRITE, _INSERT_SORTED, _REPLACE = CommitPolicy.OVERWRITE, CommitPolicy.INSERT_SORTED, EqualVersion.REPLACE
 _new_entry = partial(tuple.__new__, Entry)
+_SOON = bytes((SOON,))
 _AT_ONCE = int(socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+
+_DONT_WAIT = int(socket.MSG_DONTWAIT)
+_SHORT_NS = 200_000
+"""A datum that comes so soon is there before its reader has gone through the last one [ns]."""
+_LEAD_NS = 600_000
+"""How long before a datum is due to wake by a timer, which takes its time, and to go through the last one [ns]."""
+_NAP_NS = 300_000
+"""What is shorter is not slept [ns]."""
+_SELECTABLE = 1024
+"""Descriptors from here on cannot be waited for with a time of less than a millisecond."""
 
 _STOP_S = 5.0
 """How long a component whose backlog blocks may keep the thread that receives."""
@@ -44,13 +69,14 @@ _STOP_S = 5.0
 class _Connection:
     """A connection to the writer, and its memory."""
 
-    def __init__(self, one: socket.socket, region: Region, writer: str) -> None:
+    def __init__(self, one: socket.socket, region: Region, writer: str, scratch: Window[Any]) -> None:
         self.socket = one
         self.region = region
         self.writer = writer
         self._waiting: deque[bytes] = deque()
-        self.scratch: Window[Any] = Window("rehearsal", 1)
+        self.scratch = scratch
         """Takes in rehearsals what the topic's window takes otherwise."""
+        self.rehearsals = 0
         self.busy = False
         """While a datum is being read, it is told afterwards which slabs are no longer needed."""
 
@@ -98,6 +124,7 @@ class Importer:
         name: str,
         config: SharedMemoryConfig | None = None,
         blocks: bool = False,
+        rehearsal: Callable[[], Window[Any]] = lambda: Window("rehearsal", 1),
     ) -> None:
         """Prepares; `start` begins.
 
@@ -107,12 +134,14 @@ class Importer:
             name: Of this process; the same in its next life.
             config: Sizes.
             blocks: Whether the producer waits where this process is not ready for more.
+            rehearsal: Makes a window that takes what the topic's takes, to no effect, and goes a similar way with it.
         """
         self._config = config or SharedMemoryConfig()
         self._window = window
         self._node = node
         self._name = name
         self._blocks = blocks
+        self._rehearsal = rehearsal
         self._counts: Counter[str] = Counter()
         self._stopping = threading.Event()
         self._connection: _Connection | None = None
@@ -220,17 +249,20 @@ class Importer:
         welcome = read_greeting(data, (("writer", str), ("topic", str), ("memory", int)))
         if len(fds) != 1:
             raise SourceError(f"the process that exports {self._window.topic!r} sent no memory")
-        return _Connection(one, Region(fds[0], welcome["memory"], writable=False), welcome["writer"])
+        return _Connection(one, Region(fds[0], welcome["memory"], writable=False), welcome["writer"], self._rehearsal())
 
     def _receive(self, connection: _Connection) -> bool:
         """Receives until the writer or this reader ends; tells whether it is the writer that is gone."""
-        number, last = 0, b""
+        number, last, came = 0, b"", None
         receive, memory = connection.socket.recv, connection.region.size
-        if self._config.spin_us:
-            receive = partial(_spinning, receive, round(self._config.spin_us * 1e3))
+        expectation = Expectation(round(self._config.spin_us * 1e3), self._config.spin_share)
         while True:
             try:
                 data = receive(MESSAGE)
+                while data[:1] == _SOON:
+                    if came is not None:  # the one before was abandoned
+                        expectation.came(*came)
+                    data, came = _expect(connection, data, expectation.allowed, last)
             except OSError:
                 data = b""
             if not data:
@@ -242,10 +274,6 @@ class Importer:
                 self._damaged(0, error)
                 connection.end(ENDS)
                 return False
-            if event.kind == SOON:
-                if last:
-                    _rehearse(connection, last)
-                continue
             missing, number = event.number - number - 1, event.number
             if missing > 0:
                 self._counts["missed"] += missing
@@ -267,6 +295,9 @@ class Importer:
                     connection.tell()
             self._counts["received"] += 1
             self._counts["received_bytes"] += len(data)
+            if came is not None:
+                expectation.came(*came)
+                came = None
 
     def _damaged(self, version: int, error: ValueError) -> None:
         if not self._counts["damaged"]:
@@ -288,26 +319,52 @@ def _value(region: Region, event: Event, let_go: Callable[[int], None]) -> Any:
     return decode(body, memories)
 
 
-def _spinning(receive: Callable[..., bytes], spin_ns: int, size: int) -> bytes:
-    """Receives, and does not sleep for so long [ns]."""
-    end = time.perf_counter_ns() + spin_ns
-    while time.perf_counter_ns() < end:
+def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> tuple[bytes, tuple[int, bool]]:
+    """Receives what was announced just now, and is ready for it when it comes.
+
+    After a pause, what it takes is no longer in the processor's caches, and a core that sleeps takes long to wake: so
+    it sleeps until shortly before the datum is due, goes through the last one once more, and stays awake from there.
+
+    Args:
+        connection: Where it comes.
+        word: The announcement.
+        allowed: For how long to stay awake [ns].
+        last: The last commit.
+
+    Returns:
+        The message, and for how long it stayed awake, and whether in vain, as `Expectation.came` takes it.
+    """
+    now = time.perf_counter_ns
+    announced, one = now(), connection.socket
+    receive = one.recv
+    soon, late = read_soon(word)
+    if soon < _SHORT_NS:  # it is as good as there
+        return receive(MESSAGE), (0, False)
+    nap = soon - _LEAD_NS
+    if nap > _NAP_NS and allowed > 0 and one.fileno() < _SELECTABLE:
+        select.select((one,), (), (), nap / 1e9)
+    if last:
+        _rehearse(connection, last)
+    here = awake = now()
+    until = min(announced + late, here + allowed)
+    while here < until:
         try:
-            return receive(size, socket.MSG_DONTWAIT)
+            data = receive(MESSAGE, _DONT_WAIT)
         except BlockingIOError:
+            here = now()
             continue
-    return receive(size)
+        return data, (here - awake, False)
+    return receive(MESSAGE), (here - awake, here > awake)
 
 
 def _rehearse(connection: _Connection, data: bytes) -> None:
-    """Does with the last commit what is to be done with the next, to no effect.
-
-    After a pause, what that needs is no longer in the processor's caches; now it is fetched while the payload is built.
-    """
+    """Does with the last commit what is to be done with the next, to no effect."""
     event = read_event(data, connection.region.size)
     if not event.body_size:
+        connection.rehearsals += 1
         with suppress(ValueError):  # the memory may hold something else by now
-            publish(connection.scratch, event, _value(connection.region, event, _let_go_of_nothing))
+            value = _value(connection.region, event, _let_go_of_nothing)
+            publish(connection.scratch, event._replace(epoch=0, version=connection.rehearsals, newest=True), value)
 
 
 def _let_go_of_nothing(offset: int) -> None:

@@ -29,10 +29,13 @@ __all__ = [
     "SOON",
     "Event",
     "new_event",
+    "pack_commit",
     "pack_event",
     "pack_greeting",
+    "pack_soon",
     "read_event",
     "read_greeting",
+    "read_soon",
     "set_number",
 ]
 
@@ -56,6 +59,7 @@ _pack_head, _unpack_head, _unpack_slab, _put_number = (
     _SLAB.unpack_from,
     _NUMBER.pack_into,
 )
+_pack_commit = struct.Struct(f"{_HEAD.format}{_SLAB.format[1:]}").pack
 _PROTOCOL = 2
 _MOST_SLABS = 256
 
@@ -93,6 +97,30 @@ def pack_event(event: Event) -> bytearray:
         data += _SLAB.pack(*slab)
     data += body
     return data
+
+
+def pack_commit(
+    number: int, epoch: int, version: int, received_ns: int, committed_ns: int, triggers: bool, offset: int, size: int
+) -> bytes:
+    """What stands before the body of a commit that is the newest and lies in one slab, in one go."""
+    flags = _TRIGGERS | _NEWEST if triggers else _NEWEST
+    return _pack_commit(COMMIT, flags, 1, 0, number, epoch, version, received_ns, committed_ns, offset, size)
+
+
+def pack_soon(soon_ns: int, late_ns: int) -> bytearray:
+    """The word that a commit is about to come, and between which times from now it is expected [ns]."""
+    return pack_event(Event(SOON, 0, 0, 0, soon_ns, late_ns))
+
+
+def read_soon(data: bytes) -> tuple[int, int]:
+    """Between which times from now a commit is expected [ns].
+
+    Raises:
+        ValueError: It is truncated.
+    """
+    if len(data) < _HEAD_SIZE:
+        raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD_SIZE}")
+    return _unpack_head(data)[-2:]
 
 
 def set_number(data: bytearray, number: int) -> None:

@@ -4,6 +4,7 @@ import logging
 import os
 import socket
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from warploom.datamesh.messages import encode
 from warploom.datamesh.transport import exporting, importing
 from warploom.datamesh.transport.places import listen
 from warploom.datamesh.transport.slabs import SlabPool
-from warploom.datamesh.transport.wire import COMMIT, MESSAGE, SOON, Event, pack_event, pack_greeting
+from warploom.datamesh.transport.wire import COMMIT, MESSAGE, Event, pack_event, pack_greeting, pack_soon
 
 
 def versions(side):
@@ -237,19 +238,36 @@ def commit_of(number, body, slabs=(), body_size=0):
     return pack_event(Event(COMMIT, number, 0, number, 0, number, True, True, slabs, body, body_size))
 
 
-@pytest.mark.parametrize("spin_us", [1.0, 60e6], ids=["which then sleeps", "which does not sleep"])
-def test_a_reader_that_spins_gets_all_and_ends(linked, spin_us):
-    writer, reader = linked(spin_us=spin_us)
+@pytest.mark.parametrize("build_s", [0.0, 0.002])
+@pytest.mark.parametrize(
+    ("spin_us", "share"),
+    [(0.0, 0.1), (1.0, 1.0), (60e6, 1.0), (1000.0, 0.1)],
+    ids=["not at all", "which then sleeps", "for long", "as by default"],
+)
+def test_a_reader_that_stays_awake_gets_all_and_ends(linked, monkeypatch, spin_us, share, build_s):
+    monkeypatch.setattr(exporting, "_COLD_NS", -1)  # each payload that is begun is announced
+    monkeypatch.setattr(importing, "_SHORT_NS", -1)
+    writer, reader = linked(spin_us=spin_us, spin_share=share)
+
+    def build(change):
+        array = change.array(2000, np.int64)
+        array[:] = 7
+        time.sleep(build_s)
+        return array
+
     for version in range(1, 21):
-        writer.commit("topic", version, version)
+        writer.commit("topic", version, build)
         reader.until(lambda counts, version=version: counts.get("received") == version, "topic")
+        assert (reader.last() == 7).all()
     assert [version for _, version, _ in reader.commits["topic"]] == list(range(1, 21))
+    change = writer.output("topic").allocate_change()
+    change.array(2000, np.int64)  # of which nothing comes, while the reader ends
     thread = reader.links._imports["topic"]._thread
     reader.links.stop()
     assert not thread.is_alive()
 
 
-SOON_MESSAGE = pack_event(Event(SOON, 0, 0, 0, 0, 0))
+SOON_MESSAGE = pack_soon(1_000_000, 2_000_000)
 
 
 class TestRehearsals:
@@ -258,7 +276,7 @@ class TestRehearsals:
     def test_they_change_and_hold_nothing(self, linked, monkeypatch):
         values = []
         monkeypatch.setattr(exporting, "_COLD_NS", -1)  # each payload that is begun is announced
-        monkeypatch.setattr(exporting, "_LONG_NS", 1 << 62)
+        monkeypatch.setattr(importing, "_SHORT_NS", -1)
         monkeypatch.setattr(importing, "_rehearse", lambda *_, of=importing._rehearse: values.append(of(*_)))
         writer, reader = linked(capacity=2)
         for version in range(1, 6):

@@ -10,10 +10,13 @@ from warploom.datamesh.transport.wire import (
     SETTLE,
     SOON,
     Event,
+    pack_commit,
     pack_event,
     pack_greeting,
+    pack_soon,
     read_event,
     read_greeting,
+    read_soon,
     set_number,
 )
 
@@ -43,6 +46,26 @@ EVENTS = st.builds(
 def test_an_event_is_read_as_it_was_sent(event):
     read = read_event(pack_event(event), MEMORY)
     assert read._replace(body=bytes(read.body)) == event
+
+
+@given(TIME, TIME)
+def test_an_announcement_says_when_to_expect_what_it_announces(soon, late):
+    assert read_soon(pack_soon(soon, late)) == (soon, late)
+    assert read_event(pack_soon(soon, late), MEMORY).kind == SOON
+
+
+@given(st.binary(max_size=55))
+def test_a_short_one_is_refused(data):
+    with pytest.raises(ValueError, match="truncated"):
+        read_soon(data)
+
+
+@given(U64, U64, U64, TIME, TIME, st.booleans(), st.integers(0, MEMORY // 2), st.integers(1, MEMORY // 2), st.binary())
+def test_a_commit_in_one_slab_is_packed_the_same_way_in_one_go(
+    number, epoch, version, received, committed, triggers, offset, size, body
+):
+    event = Event(COMMIT, number, epoch, version, received, committed, triggers, True, ((offset, size),), body)
+    assert pack_commit(number, epoch, version, received, committed, triggers, offset, size) + body == pack_event(event)
 
 
 @given(EVENTS, U64)

@@ -1,0 +1,65 @@
+"""When a datum comes that was announced, and for how long its reader stays awake for it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+
+__all__ = ["Durations", "Expectation"]
+
+_REMEMBERED = 8
+_SAVED_NS = 5_000_000
+"""How much of its share a reader can save up [ns]."""
+_LONGEST_PAUSE = 256
+_LATE_NS = 200_000
+"""How much longer than all before it a payload may take, to be waited for all the same [ns]."""
+
+
+class Durations:
+    """How long payloads take to build, at a writer."""
+
+    def __init__(self) -> None:
+        """None was built yet."""
+        self._last: deque[int] = deque(maxlen=_REMEMBERED)
+
+    def add(self, took_ns: int) -> tuple[int, int]:
+        """Notes one more, and says between which times the next is to be expected [ns]."""
+        self._last.append(took_ns)
+        last = sorted(self._last)
+        return last[len(last) // 8], last[-1] + _LATE_NS
+
+
+class Expectation:
+    """Of one connection: for how long to stay awake for the next datum.
+
+    Staying awake takes a core. It is done for a bounded time around the moment at which a datum is due, for a bounded
+    share of all time, never where this process has but one core, and more and more rarely where data do not come when
+    they are due, as on a machine on which too much runs.
+    """
+
+    def __init__(self, most_ns: int, share: float) -> None:
+        """Begins with nothing saved.
+
+        Args:
+            most_ns: For how long to stay awake for one datum [ns].
+            share: Of all time, for how much.
+        """
+        self.allowed = 0
+        """For how long to stay awake for the next [ns]."""
+        self._most = most_ns if len(os.sched_getaffinity(0)) > 1 else 0
+        self._share = share
+        self._saved = self._pause = self._skip = 0
+        self._counted = time.perf_counter_ns()
+
+    def came(self, awake_ns: int, in_vain: bool) -> None:
+        """Notes for how long the reader stayed awake for a datum [ns], and whether that came later all the same."""
+        now = time.perf_counter_ns()
+        self._saved = min(_SAVED_NS, self._saved + round(self._share * (now - self._counted))) - awake_ns
+        self._counted = now
+        if awake_ns:
+            self._pause = min(_LONGEST_PAUSE, 2 * self._pause + 1) if in_vain else self._pause // 2
+            self._skip = self._pause
+        elif self._skip:
+            self._skip -= 1
+        self.allowed = 0 if self._skip else min(self._most, self._saved)
