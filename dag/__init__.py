@@ -2,8 +2,9 @@
 
 from ..datamesh import Status
 from .backlog import BacklogConfig
-from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
+from .component import Component, DataProcessComponent, GenericComponent
 from .configuration import ConfigFile, find_config, import_class, nearest, parse_overrides
+from .dag_component import DagComponent, MonotonicDagComponent
 from .deadline import DeadlineConfig
 from .drawing import draw_mermaid, draw_text
 from .engine import GraphEngine, Run, Vertex, VertexTiming

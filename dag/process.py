@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 from ..datamesh import DataMesh, Input
 from ..errors import ConfigError
 from .backlog import BacklogConfig
-from .component import Component, DagComponent, DataProcessComponent, GenericComponent, MonotonicDagComponent
+from .component import Component, DataProcessComponent, GenericComponent
 from .configuration import ConfigFile, import_class, nearest
+from .dag_component import DagComponent, MonotonicDagComponent
 from .engine import VertexTiming
 from .flags import load_flags
 from .garbage import FrozenHeap

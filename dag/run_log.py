@@ -16,7 +16,8 @@ from typing import Any
 
 from ..datamesh import Entry, Miss, Outcome, Status
 from ..datamesh.recording import READS, RUNS, RecordedEvent
-from .component import DagComponent, DataProcessComponent
+from .component import DataProcessComponent
+from .dag_component import DagComponent
 from .engine import VertexTiming
 from .process import Process
 from .recorded_accesses import Access, LoggedAccesses, ReplayedAccesses, decode_access
