@@ -82,10 +82,10 @@ def taken(data: np.ndarray) -> tuple[int, int]:
 
 
 class Warploom(Way):
-    """A topic of the mesh, whose payload is built in place, to a component that runs for it."""
+    """A topic of the mesh, whose payload is built in place, to a component that runs for it, as a launched one does."""
 
     remote: str | None = None
-    hand_off: Literal["thread", "inline"] = "thread"
+    hand_off: Literal["thread", "inline"] = "inline"
     spin_us = 1000.0
 
     def __init__(self, name: str, size: int, queue: Any) -> None:
@@ -155,13 +155,13 @@ class Warploom(Way):
         return times
 
 
-class WarploomInline(Warploom):
-    """The same to a component that runs in the thread that receives: `hand_off: inline`."""
+class WarploomThread(Warploom):
+    """The same to a component with a thread of its own: `hand_off: thread`."""
 
-    hand_off = "inline"
+    hand_off = "thread"
 
 
-class WarploomSleeping(WarploomInline):
+class WarploomSleeping(Warploom):
     """The same, where the thread that receives sleeps until a datum is there: `spin_us: 0`."""
 
     spin_us = 0.0
@@ -364,8 +364,8 @@ def _port(name: str) -> int:
 
 WAYS: dict[str, type[Way]] = {
     "warploom": Warploom,
-    "warploom, inline": WarploomInline,
-    "warploom, inline, sleeping": WarploomSleeping,
+    "warploom, hand_off: thread": WarploomThread,
+    "warploom, spin_us: 0": WarploomSleeping,
     "warploom over zenoh": WarploomZenoh,
     "multiprocessing.Queue": Queue,
     "zenoh": Zenoh,

@@ -9,7 +9,7 @@ import argparse
 import json
 import logging
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..dag.configuration import ConfigFile, parse_overrides
 from ..dag.launch.channel import Channel
 from ..dag.launch.child import Child, ProcessLinks, die_with, end_at_once, show_name
+from ..dag.launch.handing import hand_over
 from ..dag.launch.schema import LaunchSpec, ProcessSpec
 from ..dag.logs import start_logging
 from ..dag.modules import load_module
@@ -166,7 +167,7 @@ def monitor_processes() -> list[ProcessSpec]:
 def build_process(
     files: Sequence[ConfigFile[ModuleSpec]],
     profile: ConfigFile[Profile],
-    imports: Iterable[str],
+    imports: Collection[str],
     *,
     prepare: bool = True,
 ) -> Process:
@@ -177,6 +178,7 @@ def build_process(
         DeviceError: There is no such device.
         ModelError: A model does not fit its card.
     """
+    hand_over(files, set(imports))
     # Where the CPU is meant nobody need be asked for it: Warp is loaded by the components that compute with it.
     device = "cpu" if profile.content.device == "cpu" else profile_device(profile.content)
     context = execution_context(profile, device)

@@ -87,6 +87,7 @@ class Window(Generic[T]):
         self._on_commit: tuple[OnCommit, ...] = ()
         self._on_settle: tuple[OnSettle, ...] = ()
         self._after: tuple[Callable[[], None], ...] = ()
+        self._puts_off = False
         self._waits: list[Waiting[T]] = []
         self._held: list[_Held] = []
         self._modified: set[tuple[int, int]] = set()
@@ -176,9 +177,21 @@ class Window(Generic[T]):
                 status = self._hold(policy, entry, equal, triggers)
             else:
                 raise TypeError(f"policy must be a CommitPolicy or a Reorder, not {policy!r}")
-        for after in self._after:
-            after()
+        if not self._puts_off:
+            for after in self._after:
+                after()
         return status
+
+    def put_off(self, more: bool) -> None:
+        """Says whether more commits follow at once: what is called after a commit then waits for the last of them.
+
+        For the thread that makes all commits of the window, such as one that receives them: a component that runs in
+        it is so given the newest of those that wait, and not one after the other.
+        """
+        before, self._puts_off = self._puts_off, more
+        if before and not more:
+            for after in self._after:
+                after()
 
     def _publish(
         self, policy: CommitPolicy, entry: Entry[T], equal: EqualVersion, triggers: bool | None = None
@@ -312,8 +325,9 @@ class Window(Generic[T]):
                 _log.exception("a subscriber of %s failed at the settled version %d", self.topic, version)
         if self._waits:
             self._end_waits()
-        for after in self._after:
-            after()
+        if not self._puts_off:
+            for after in self._after:
+                after()
 
     def new_epoch(self, epoch: int | None = None) -> int:
         """Starts over, empty: versions may begin anew. Gives the epoch.

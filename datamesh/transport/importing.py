@@ -253,20 +253,38 @@ class Importer:
 
     def _receive(self, connection: _Connection) -> bool:
         """Receives until the writer or this reader ends; tells whether it is the writer that is gone."""
+        try:
+            return self._receive_all(connection)
+        finally:
+            self._window.put_off(False)
+
+    def _receive_all(self, connection: _Connection) -> bool:
         number, last, came = 0, b"", None
-        receive, memory = connection.socket.recv, connection.region.size
+        window, receive, memory = self._window, connection.socket.recv, connection.region.size
         expectation = Expectation(round(self._config.spin_us * 1e3), self._config.spin_share)
+        flags, more = 0, False
         while True:
             try:
-                data = receive(MESSAGE)
-                while data[:1] == _SOON:
+                data = receive(MESSAGE, flags)
+                while data[:1] == _SOON and not more:
                     if came is not None:  # the one before was abandoned
                         expectation.came(*came)
                     data, came = _expect(connection, data, expectation.allowed, last)
+            except BlockingIOError:  # all that had come is in the window
+                if more:
+                    more = False
+                    window.put_off(False)
+                else:
+                    flags = 0
+                continue
             except OSError:
                 data = b""
             if not data:
                 return not self._stopping.is_set()
+            if flags and not more:  # it had come while a component ran in this thread: there may be more behind it
+                more = True
+                window.put_off(True)
+            flags = _DONT_WAIT
             try:
                 event = read_event(data, memory)
             except ValueError as error:
@@ -274,30 +292,38 @@ class Importer:
                 self._damaged(0, error)
                 connection.end(ENDS)
                 return False
+            if event.kind == SOON:
+                continue
             missing, number = event.number - number - 1, event.number
             if missing > 0:
                 self._counts["missed"] += missing
-                self._window.losses.count(self._window.topic, "link_missed", event.version, missing)
+                window.losses.count(window.topic, "link_missed", event.version, missing)
             if event.kind == SETTLE:
-                self._window.settle(event.version, event.epoch)
-            else:
+                window.settle(event.version, event.epoch)
+            elif self._take(connection, event):
                 last = data
-                connection.busy = True
-                try:
-                    value = _value(connection.region, event, connection.let_go)
-                    publish(self._window, event, value)
-                    del value
-                except ValueError as error:
-                    self._damaged(event.version, error)
-                    continue
-                finally:
-                    connection.busy = False
-                    connection.tell()
+            else:
+                continue
             self._counts["received"] += 1
             self._counts["received_bytes"] += len(data)
             if came is not None:
                 expectation.came(*came)
                 came = None
+
+    def _take(self, connection: _Connection, event: Event) -> bool:
+        """Publishes a commit; tells whether it could be read."""
+        connection.busy = True
+        try:
+            value = _value(connection.region, event, connection.let_go)
+            publish(self._window, event, value)
+            del value
+        except ValueError as error:
+            self._damaged(event.version, error)
+            return False
+        finally:
+            connection.busy = False
+            connection.tell()
+        return True
 
     def _damaged(self, version: int, error: ValueError) -> None:
         if not self._counts["damaged"]:

@@ -345,6 +345,22 @@ def commit_and_read(seconds_or_rounds, seed, threads=8, capacity=16):
     return problems, len(statuses), kept, counted
 
 
+def test_what_is_called_after_commits_that_follow_each_other_waits_for_the_last_of_them():
+    window, calls = Window("topic"), []
+    window.subscribe(
+        lambda entry: calls.append(entry.version), lambda version, _: calls.append(-version), lambda: calls.append("!")
+    )
+    window.commit(DISCARD, entry(1))
+    window.put_off(True)
+    window.commit(DISCARD, entry(2))
+    window.settle(3)
+    window.commit(DISCARD, entry(4))
+    window.put_off(False)
+    window.put_off(False)
+    window.commit(DISCARD, entry(5))
+    assert calls == [1, "!", 2, -3, 4, "!", 5, "!"]
+
+
 def test_eight_threads_commit_and_read_without_a_torn_snapshot():
     """Versions are sorted, unique and at most `capacity`; every commit is kept or counted; triggers rise."""
     problems, commits, kept, counted = commit_and_read(150, seed=1)

@@ -126,6 +126,45 @@ class TestCommits:
         assert reader.mesh.window("double").snapshot().last() == 42
 
 
+@pytest.mark.parametrize("backlog", [BacklogConfig(), BacklogConfig(policy="fifo", depth=2)])
+def test_a_component_that_runs_in_the_thread_that_receives_is_given_what_its_backlog_keeps(linked, backlog):
+    """As one with a thread of its own: what comes while it runs waits in its backlog, and not before the window."""
+    ran, running, go_on = [], threading.Event(), threading.Event()
+
+    class Slow(DataProcessComponent):
+        number: Input[int]
+
+        def process(self, trigger):
+            with self.number.access() as snapshot:
+                ran.append((trigger.version, snapshot.versions[-1]))
+            running.set()
+            assert go_on.wait(30)
+            return Status.OK
+
+    writer, reader = linked(capacity=8)
+    component = Slow("slow")
+    component.bind(reader.mesh, {"number": "topic"})
+    component.set_trigger("number", backlog, "inline")
+    component.start()
+    writer.commit("topic", 1, 1)
+    assert running.wait(30)
+    for version in (2, 3, 4, 5):
+        writer.commit("topic", version, version)
+    writer.output("topic").settle(6)
+    writer.commit("topic", 7, 7)
+    go_on.set()
+    last = [7] if backlog.policy == "latest" else [5, 7]
+    reader.wait(lambda: len(ran) == 1 + len(last))
+    assert ran == [(1, 1), *((version, 7) for version in last)]
+    assert component.losses["slow", "backlog"] == 5 - len(last)
+    running.clear()
+    writer.commit("topic", 8, 8)
+    assert running.wait(30), "it goes on as before"
+    reader.links.stop()
+    component.stop()
+    assert [version for _, version, _ in reader.commits["topic"]] == [1, 2, 3, 4, 5, 7, 8]
+
+
 class TestLives:
     """Either side ends and comes back."""
 
