@@ -19,15 +19,17 @@ _WAY_OUT = "Way out: a systemd unit with Delegate=yes, or a group that root has 
 class ControlGroups:
     """Makes groups, puts processes into them, and removes those that it made."""
 
-    def __init__(self, mount: Path | None = None, own: str | None = None) -> None:
+    def __init__(self, mount: Path | None = None, own: str | None = None, ledger: Path | None = None) -> None:
         """Looks where groups can be made.
 
         Args:
             mount: Where cgroup v2 is mounted; by default as the system says.
             own: The group of this process below it, such as /user.slice; by default as the system says.
+            ledger: Where to note the groups that are made, for who comes after this process was killed.
         """
         self._mount = _mounted() if mount is None else mount
         self._own = (_own_group() if own is None else own).strip("/")
+        self._ledger = ledger
         self._made: list[Path] = []
         self._moved = False
 
@@ -74,6 +76,44 @@ class ControlGroups:
         self._make(folder.parent)
         folder.mkdir()
         self._made.append(folder)
+        self._note()
+
+    def _note(self) -> None:
+        """Writes down which groups are to be removed."""
+        if self._ledger is None:
+            return
+        with contextlib.suppress(OSError):  # without it they stay after a kill, and nothing else is amiss
+            if self._made:
+                self._ledger.write_text("".join(f"{folder}\n" for folder in self._made), encoding="utf-8")
+            else:
+                self._ledger.unlink(missing_ok=True)
+
+    def reap(self) -> list[str]:
+        """Removes the groups that a life before has noted and left, and names them.
+
+        One in which a process still is becomes this one's own, which `close` removes.
+        """
+        if self._ledger is None or self._mount is None:
+            return []
+        try:
+            noted = [Path(line) for line in self._ledger.read_text(encoding="utf-8").splitlines()]
+        except (OSError, UnicodeDecodeError):
+            return []
+        removed, left = [], []
+        for folder in reversed(noted):
+            if self._mount not in folder.parents or ".." in folder.parts or not folder.is_dir():
+                continue
+            if folder.name == _OWN_LEAF:
+                with contextlib.suppress(OSError):
+                    (folder.parent / "cgroup.subtree_control").write_text("-cpu -memory")
+            try:
+                folder.rmdir()
+                removed.append(str(folder))
+            except OSError:
+                left.append(folder)
+        self._made = [*reversed(left), *self._made]
+        self._note()
+        return removed
 
     def _limit(self, group: str, folder: Path, values: dict[str, str]) -> list[str]:
         """Writes the limits of a group; what cannot be limited is told."""
@@ -118,9 +158,15 @@ class ControlGroups:
                 (top / "cgroup.subtree_control").write_text("-cpu -memory")
                 (top / "cgroup.procs").write_text(f"{os.getpid()}\n")
             self._moved = False
+        left = []
         for folder in reversed(self._made):
-            with contextlib.suppress(OSError):
+            try:
                 folder.rmdir()
+            except OSError:
+                if folder.is_dir():  # somebody is still in it: for the next start
+                    left.append(folder)
+        self._made = list(reversed(left))
+        self._note()
         self._made.clear()
 
 

@@ -75,7 +75,7 @@ class Supervisor:
         self._on_event = on_event
         self._child_plan = child_plan
         self._refresh = refresh
-        self._groups = ControlGroups()
+        self._groups = ControlGroups(ledger=self.folder.path / "cgroups")
         self._gate_open = False
         self._ending: asyncio.Event = asyncio.Event()
         self._exit_code = 0
@@ -116,7 +116,7 @@ class Supervisor:
         self._control = ControlServer(self.folder.control, self._answers())
         await self._control.open()
         try:
-            self._clean()
+            self._clean(self._groups.reap())
             for spec in self.plan.spec.processes:
                 self._add(spec)
             self._tell({"event": "launching", "pid": os.getpid(), "processes": list(self.processes)})
@@ -155,12 +155,13 @@ class Supervisor:
             before_start=self._clean,
         )
 
-    def _clean(self) -> None:
+    def _clean(self, removed: Sequence[str] = ()) -> None:
+        """Removes what dead processes have left, and tells of it, and of what was removed just before."""
+        removed = list(removed)
         try:
-            removed = list(self._reap(self.plan.node))
+            removed += self._reap(self.plan.node)
         except OSError as error:
             _log.warning("what dead processes left cannot be removed: %s", error)
-            return
         if removed:
             self.reaped += removed
             self._tell({"event": "reaped", "removed": removed})

@@ -148,3 +148,65 @@ def test_a_real_process_is_in_a_real_group_with_its_limits(sleeper, limits):
         groups.close()
     assert not any(groups._mount.glob(f"**/warploom-test-{os.getpid()}"))
     assert Path("/proc/self/cgroup").read_text() == before
+
+
+def test_what_a_life_before_left_is_removed_by_the_next(tmp_path):
+    mount, ledger = tmp_path / "mount", tmp_path / "cgroups"
+    (mount / "others").mkdir(parents=True)
+    killed = ControlGroups(mount, "/", ledger)
+    for name in ("app/one", "app/two", "others/three"):
+        assert killed.join(name, 4711) == []
+        (mount / name / "cgroup.procs").unlink()
+    (mount / "app" / "two" / "busy").mkdir()
+    following = ControlGroups(mount, "/", ledger)
+    assert following.reap() == [str(mount / "others" / "three"), str(mount / "app" / "one")]
+    assert sorted(path.name for path in mount.rglob("*")) == ["app", "busy", "others", "two"]
+    (mount / "app" / "two" / "busy").rmdir()
+    following.close()
+    assert [path.name for path in mount.iterdir()] == ["others"], "what others made is theirs"
+    assert not ledger.exists()
+    assert ControlGroups(mount, "/", ledger).reap() == []
+
+
+def test_a_note_that_is_damaged_or_speaks_of_other_folders_removes_nothing(tmp_path):
+    mount, ledger, other = tmp_path / "mount", tmp_path / "cgroups", tmp_path / "other"
+    for folder in (mount, other):
+        folder.mkdir()
+    ledger.write_text(f"{other}\n{mount}/../other\n{mount}\n\nnonsense\n")
+    assert ControlGroups(mount, "/", ledger).reap() == []
+    ledger.write_bytes(b"\xff\xfe")
+    assert ControlGroups(mount, "/", ledger).reap() == []
+    assert other.is_dir()
+    assert mount.is_dir()
+
+
+KILLED = """
+import os, pathlib, signal, sys
+from warploom.dag.launch.cgroup import ControlGroups
+groups = ControlGroups(ledger=pathlib.Path(sys.argv[1]))
+for warning in groups.join(sys.argv[2], int(sys.argv[3])):
+    print(warning)
+sys.stdout.flush()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_real_groups_of_one_that_was_killed_are_removed_once_nobody_is_in_them(tmp_path, sleeper):
+    ledger, top = tmp_path / "cgroups", f"warploom-test-killed-{os.getpid()}"
+    ran = subprocess.run(
+        [sys.executable, "-c", KILLED, str(ledger), f"{top}/one", str(sleeper.pid)], capture_output=True, text=True
+    )
+    if ran.stdout:
+        pytest.skip(ran.stdout)
+    groups = ControlGroups(ledger=ledger)
+    assert any(groups._mount.glob(f"**/{top}/one"))
+    try:
+        assert groups.reap() == [], "a process is in it"
+    finally:
+        sleeper.kill()
+        sleeper.wait()
+    following = ControlGroups(ledger=ledger)
+    removed = following.reap()
+    assert [path.endswith(end) for path, end in zip(removed, (f"{top}/one", top), strict=True)] == [True, True]
+    assert not any(groups._mount.glob(f"**/{top}"))
+    assert not ledger.exists()

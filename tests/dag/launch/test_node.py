@@ -254,7 +254,8 @@ def test_a_stop_while_it_builds_ends_it_at_once(start, module, launch_file):
 
 
 def test_the_children_end_with_a_killed_supervisor_and_the_next_one_reaps(start, chain, tmp_path):
-    node = start("launch", chain()).up()
+    group = f"warploom-test-node-{os.getpid()}/app"
+    node = start("launch", chain(cgroup=group)).up()
     node.wait_until(lambda: len(versions(tmp_path / "node-writer")) > 5)
     os.kill(node.process("source")["pid"], signal.SIGKILL)  # leaves its socket behind
     os.kill(node.supervisor.pid, signal.SIGKILL)
@@ -262,12 +263,16 @@ def test_the_children_end_with_a_killed_supervisor_and_the_next_one_reaps(start,
     node.wait_until(lambda: not node.children())
     left = sorted(path.name for path in (tmp_path / "run" / "node" / "links").iterdir())
     assert "ticks.socket" in left
-    again = start("launch", chain()).up()
-    removed = [Path(path).name for path in again.find("reaped")[0]["removed"]]
-    assert "ticks.socket" in removed
+    ledger = tmp_path / "run" / "node" / "cgroups"
+    groups = ledger.read_text().split() if ledger.exists() else []  # there are none where they are not permitted
+    again = start("launch", chain(cgroup=group)).up()
+    removed = again.find("reaped")[0]["removed"]
+    assert "ticks.socket" in [Path(path).name for path in removed]
+    assert set(groups) <= set(removed)
     count = len(versions(tmp_path / "node-writer"))
     again.wait_until(lambda: len(versions(tmp_path / "node-writer")) > count + 5)
     assert again.stop() == 0
+    assert not any(Path(path).exists() for path in (*groups, ledger))
 
 
 def test_two_nodes_run_side_by_side_and_one_of_a_name_alone(start, chain, tmp_path):
