@@ -30,6 +30,13 @@ def main(
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
     start_from: Annotated[Path | None, typer.Option(help="Begin with the weights of this checkpoint.")] = None,
     learning_rate: Annotated[float, typer.Option(help="The highest of the cycle.")] = 3e-3,
+    final_share: Annotated[float, typer.Option(help="What is left of it at the end.")] = 0.002,
+    frozen: Annotated[
+        bool, typer.Option("--frozen", help="Batch norms keep the statistics of --start-from: steps take half as long.")
+    ] = False,
+    fresh: Annotated[
+        int | None, typer.Option(help="New windows in a batch of four; the others are known ones, turned.")
+    ] = None,
     threads: Annotated[int, typer.Option(help="CPU threads of the network.")] = 1,
     loader: Annotated[bool, typer.Option("--loader", help="Let a process beside draw the batches.")] = False,
     workers: Annotated[int, typer.Option(help="Processes that simulate.")] = 1,
@@ -58,6 +65,9 @@ def main(
         frames_folder=frames_folder,
         start_from=start_from,
         learning_rate=learning_rate,
+        final_share=final_share,
+        frozen=frozen,
+        fresh=fresh,
         threads=threads,
         loaders=int(loader),
         workers=workers,

@@ -29,7 +29,8 @@ from .frames import (
     simulate_views,
 )
 from .network import STRIDE, PillarCenterNet
-from .targets import draw_targets, extra_loss, loss
+from .targets import draw_targets, loss
+from .windows import Window, Windows, window_of
 
 __all__ = ["TrainingConfig", "TrainingResult", "make_frames", "train"]
 
@@ -57,6 +58,12 @@ class TrainingConfig:
     frames_folder: Path | None = None
     """Where they are kept, and found again by the next training; None is `out`/frames."""
     batch: int = 4
+    fresh: int | None = None
+    """How many windows of a batch are new; the others were learnt from before, and are turned. None: all."""
+    kept: int = 4000
+    """How many windows are kept to be learnt from again."""
+    frozen: bool = False
+    """Batch norms keep the statistics they have, which halves the time of a step; for `start_from`."""
     window: float = 40.0
     """Half the edge of the square learnt from [m], a multiple of 8 cells."""
     cell: float = 0.25
@@ -67,6 +74,8 @@ class TrainingConfig:
     extras: tuple[str, ...] = ()
     """What a further branch learns, of `network.EXTRAS`."""
     learning_rate: float = 3e-3
+    final_share: float = 0.002
+    """What is left of the learning rate at the end."""
     weight_decay: float = 0.01
     average: float = 0.998
     """Decay of the running average of the weights, which is what is exported."""
@@ -85,6 +94,8 @@ class TrainingConfig:
         if (self.minutes is None) == (self.iterations is None):
             raise ValueError("give either minutes or iterations, not both and not neither")
         cells = 2.0 * self.window / self.cell
+        if self.fresh is not None and not 1 <= self.fresh <= self.batch:
+            raise ValueError(f"fresh must be from 1 to the batch, {self.batch}, not {self.fresh}")
         if self.loaders not in (0, 1):
             raise ValueError(f"loaders must be 0 or 1, not {self.loaders}")
         if self.views < 1:
@@ -147,10 +158,8 @@ def make_views(folder: Path, seeds: range, views: int, nice: int = 0) -> None:
                 save_frame(path, frame)
 
 
-def _sample(
-    frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator
-) -> tuple[np.ndarray, ...]:
-    """Input and targets of one variation of a frame."""
+def _sample(frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator) -> Window:
+    """One variation of a frame."""
     frame = replace(frame, boxes=labelled_boxes(frame.boxes, frame.classes))
     varied = augment(frame, rng, config.augmentation)
     xyz = np.ascontiguousarray(varied.xyz)[: grid.capacity]
@@ -167,22 +176,20 @@ def _sample(
         ground=-varied.sensor_height,
         velocities=varied.velocities,
     )
-    maps = (targets.heat, targets.mask, targets.values, targets.weight, targets.velocity)
-    return grid.grid.numpy()[0].copy(), *maps
+    return window_of(grid.grid.numpy()[0], config.channels, targets)
 
 
-class _Batches(IterableDataset):
-    """Batches without end; batch i depends on the seed, i and the frames there are.
+class _Fresh(IterableDataset):
+    """The new windows of each iteration, without end; those of i depend on the seed, i and the frames there are.
 
-    A process beside the one that trains may draw them: what it takes to read, vary and draw four crops is a third of
-    what it takes to learn from them.
+    A process beside the one that trains may draw them.
     """
 
     def __init__(self, config: TrainingConfig, start: int):
         self._config, self._start = config, start
 
-    def __iter__(self) -> Iterator[list[torch.Tensor]]:
-        """The batches from the first on."""
+    def __iter__(self) -> Iterator[list[Window]]:
+        """From the first iteration on."""
         config, window = self._config, self._config.window
         grid = PillarGrid(
             point_range=(-window, -window, -2.0, window, window, 6.0), cell=config.cell, channels=config.channels,
@@ -194,9 +201,9 @@ class _Batches(IterableDataset):
             rng = np.random.default_rng([config.seed, iteration])
             there = look()
             samples = []
-            for choice in rng.integers(len(there), size=config.batch):
+            for choice in rng.integers(len(there), size=config.fresh or config.batch):
                 samples.append(_sample(load_frame(there[choice]), grid, config, rng))
-            yield [torch.from_numpy(np.stack(part)) for part in zip(*samples, strict=True)]
+            yield samples
             iteration += 1
 
 
@@ -204,22 +211,23 @@ def _stand_back(_: int) -> None:
     torch.set_num_threads(1)
 
 
-def _batches(config: TrainingConfig, start: int) -> Iterator[list[torch.Tensor]]:
+def _fresh(config: TrainingConfig, start: int) -> Iterator[list[Window]]:
     if config.loaders == 0:
-        return iter(_Batches(config, start))
+        return iter(_Fresh(config, start))
     return iter(
         DataLoader(
-            _Batches(config, start), batch_size=None, num_workers=1, prefetch_factor=4, worker_init_fn=_stand_back,
+            _Fresh(config, start), batch_size=None, num_workers=1, prefetch_factor=4, worker_init_fn=_stand_back,
             multiprocessing_context="spawn",
         )
     )  # fmt: skip
 
 
-def _rate(progress: float, peak: float) -> float:
-    """One cycle: a short warm-up, then a cosine down to nearly nothing."""
+def _rate(progress: float, peak: float, final_share: float) -> float:
+    """One cycle: a short warm-up, then a cosine down to the share that is left."""
     if progress < 0.05:
         return peak * (0.1 + 0.9 * progress / 0.05)
-    return peak * (0.002 + 0.998 * 0.5 * (1.0 + math.cos(math.pi * (progress - 0.05) / 0.95)))
+    left = 0.5 * (1.0 + math.cos(math.pi * (progress - 0.05) / 0.95))
+    return peak * (final_share + (1.0 - final_share) * left)
 
 
 def _running_average(decay: float) -> Callable[[torch.Tensor, torch.Tensor, int], torch.Tensor]:
@@ -285,7 +293,9 @@ def train(config: TrainingConfig) -> TrainingResult:
         memory_format=torch.channels_last
     )
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_running_average(config.average), use_buffers=True)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    optimiser = torch.optim.AdamW(
+        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
     checkpoint = config.out / "checkpoint.pt"
     iteration, spent = 0, 0.0
     if checkpoint.exists():
@@ -327,20 +337,21 @@ def train(config: TrainingConfig) -> TrainingResult:
 
     network.train()
     last_saved = time.monotonic()
-    for batch in _batches(config, iteration):
+    windows = Windows(config.kept)
+    for new in _fresh(config, iteration):
         minutes = (time.monotonic() - began) / 60.0
         progress = iteration / config.iterations if config.iterations else minutes / float(config.minutes or 1.0)
         if progress >= 1.0:
             break
         for group in optimiser.param_groups:
-            group["lr"] = _rate(progress, config.learning_rate)
-        pillars = batch[0].contiguous(memory_format=torch.channels_last)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            maps, said = network.forward_all(pillars)
-        total, parts = loss(maps, *batch[1:5])
-        if said is not None:
-            more, further = extra_loss(config.extras, said, maps, *batch[3:])
-            total, parts = total + 0.2 * more, parts | further
+            group["lr"] = _rate(progress, config.learning_rate, config.final_share)
+        batch = windows.batch(new, config.batch, np.random.default_rng([config.seed, iteration, 1]))
+        if config.frozen:
+            maps = network.folded_maps(batch.pillars, frozen=True)
+        else:
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                maps = network.folded_maps(batch.pillars)
+        total, parts = loss(maps, batch, config.extras)
         optimiser.zero_grad(set_to_none=True)
         total.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)
@@ -373,7 +384,8 @@ def train(config: TrainingConfig) -> TrainingResult:
 
 def described(config: TrainingConfig, result: TrainingResult) -> dict[str, object]:
     """What a card says of a training."""
-    names = ("batch", "window", "cell", "width", "depth", "views", "learning_rate", "weight_decay", "average")
+    names = ("batch", "fresh", "kept", "frozen", "window", "cell", "width", "depth", "views")
+    names += ("learning_rate", "final_share", "weight_decay", "average")
     recipe = {name: getattr(config, name) for name in names} | {"augmentation": asdict(config.augmentation)}
     if config.channels != pillar_channels():
         recipe["channels"] = list(config.channels)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from .network import HEAD_CLASSES, REGRESSION
+from .network import HEAD_CLASSES, REGRESSION, UNFOLD
 
-__all__ = ["Targets", "draw_targets", "extra_loss", "loss", "overlap"]
+if TYPE_CHECKING:
+    from .windows import Batch
+
+__all__ = ["Targets", "draw_targets", "loss", "overlap"]
 
 _CELL = 0.5  # [m] edge of an output cell
 # An object with fewer returns is neither asked for nor counted as false.
@@ -20,11 +24,12 @@ _LEAST_SPREAD = 0.7
 # Cells round the centre that learn the box too, so that a peak one cell off still gives a good one.
 _NEIGHBOURHOOD = 1
 _SPEED = 10.0  # [m/s] of a velocity of 1 in the maps
-_WEIGHTS = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.3, 0.3])
+# The overlap says nothing of headings, which therefore weigh more.
+_WEIGHTS = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 0.3, 0.3])
 # Of the heat maps: people and riders are a third as many as vehicles, and look less alike.
 _CLASS_WEIGHTS = torch.tensor([1.0, 1.5, 1.5, 1.0, 1.0])
 # Of what a box lacks of its overlap: 0.2 m are much for a person and little for a bus, which L1 does not know.
-_OVERLAP_WEIGHT = 1.5
+_OVERLAP_WEIGHT = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,37 +111,69 @@ def draw_targets(
     return Targets(heat=heat, mask=mask, values=values, weight=weight, velocity=velocity)
 
 
-def loss(
-    maps: torch.Tensor, heat: torch.Tensor, mask: torch.Tensor, values: torch.Tensor, weight: torch.Tensor
-) -> tuple[torch.Tensor, dict[str, float]]:
+class _FalsePeaks(torch.autograd.Function):
+    """The sum of w · p² · −log(1 − p) over probabilities p = sigmoid(logits), with its gradient at once.
+
+    By automatic differentiation it takes a dozen passes over maps that are nearly all background.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, logits: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+        """The sum."""
+        logits = logits.float()
+        p = torch.sigmoid(logits)
+        least = functional.softplus(logits)
+        share = p.square().mul_(w)
+        ctx.save_for_backward((1.0 - p).mul_(2.0).mul_(least).add_(p).mul_(share))
+        return (share * least).sum()
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
+        """Of the logits."""
+        (slope,) = ctx.saved_tensors
+        return grad * slope, None
+
+
+def loss(maps: torch.Tensor, batch: Batch, extras: tuple[str, ...] = ()) -> tuple[torch.Tensor, dict[str, float]]:
     """The penalty-reduced focal loss of the heat maps (CornerNet, Law & Deng 2018), L1 of the boxes and their overlap.
 
+    And L1 of the extras: of the overlap that the boxes really have, and of velocities where they are known.
+
     Args:
-        maps: What the network said, shape (n, classes + regression, H, W).
-        heat: As in `Targets`, batched, as are the others.
-        mask: Shape (n, classes, H, W).
-        values: Shape (n, regression, H, W).
-        weight: Shape (n, H, W).
+        maps: What the network said, folded: shape (n, (classes + regression + extras) · UNFOLD², H / 4, W / 4).
+        batch: Of the same windows.
+        extras: What the network says besides, of `network.EXTRAS`.
 
     Returns:
         The sum, and its parts as numbers.
     """
-    logits = maps[:, : len(HEAD_CLASSES)].float()
-    boxes = maps[:, len(HEAD_CLASSES) :].float()
-    probability = torch.sigmoid(logits)
-    peaks = heat >= 1.0
-    positive = -((1.0 - probability) ** 2) * functional.logsigmoid(logits) * peaks
-    negative = -(probability**2) * (1.0 - heat) ** 4 * functional.logsigmoid(-logits) * (~peaks) * mask
-    objects = peaks.sum().clamp(min=1)
-    focal = ((positive + negative).sum(dim=(0, 2, 3)) * _CLASS_WEIGHTS.to(logits)).sum() / objects
-    scale = _WEIGHTS.to(boxes)[None, :, None, None] * weight[:, None]
-    everything = weight.sum().clamp(min=1.0)
-    box = ((boxes - values).abs() * scale).sum() / everything
-    cells = weight > 0
-    lacking = 1.0 - overlap(boxes.movedim(1, -1)[cells], values.movedim(1, -1)[cells])
-    apart = (lacking * weight[cells]).sum() / everything
-    parts = {"heat": float(focal.detach()), "box": float(box.detach()), "apart": float(apart.detach())}
-    return focal + 0.5 * box + _OVERLAP_WEIGHT * apart, parts
+    inner, classes = UNFOLD**2, len(HEAD_CLASSES)
+    rows = maps.permute(0, 2, 3, 1)
+    logits = rows[..., : classes * inner]
+    weights = _CLASS_WEIGHTS.to(maps.device)
+    centres = logits.reshape(-1)[batch.peaks].float()
+    kinds = batch.peaks % (classes * inner) // inner
+    objects = max(len(batch.peaks), 1)
+    false = _FalsePeaks.apply(logits, batch.calm * weights.repeat_interleave(inner))
+    missed = (weights[kinds] * (1.0 - torch.sigmoid(centres)) ** 2 * functional.softplus(-centres)).sum()
+    focal = (false + missed) / objects
+    window, row, column, place = batch.where
+    said = rows[window, row, column].view(len(place), -1, inner).float()
+    said = said.gather(2, place[:, None, None].expand(-1, said.shape[1], 1))[:, :, 0]
+    boxes, more = said[:, classes : classes + len(REGRESSION)], said[:, classes + len(REGRESSION) :]
+    everything = batch.weight.sum().clamp(min=1.0)
+    box = ((boxes - batch.values).abs() @ _WEIGHTS.to(boxes) * batch.weight).sum() / everything
+    common = overlap(boxes, batch.values)
+    apart = ((1.0 - common) * batch.weight).sum() / everything
+    total = focal + 0.5 * box + _OVERLAP_WEIGHT * apart
+    parts = {"heat": focal, "box": box, "apart": apart}
+    for k, name in enumerate(extras):
+        wanted = 2.0 * common.detach() - 1.0 if name == "iou" else batch.velocity[:, 0 if name == "vx" else 1]
+        known = batch.weight * torch.isfinite(wanted)
+        off = ((more[:, k] - torch.nan_to_num(wanted)).abs() * known).sum() / known.sum().clamp(min=1.0)
+        total = total + 0.2 * off
+        parts[name] = off
+    return total, {name: float(part.detach()) for name, part in parts.items()}
 
 
 def overlap(boxes: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -154,35 +191,3 @@ def overlap(boxes: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     union = size.prod(1) + true.prod(1) - common
     turned = torch.atan2(boxes[:, 7].detach(), boxes[:, 6].detach()) - torch.atan2(values[:, 7], values[:, 6])
     return common / union.clamp(min=1e-6) * torch.cos(0.5 * turned).abs()
-
-
-def extra_loss(
-    extras: tuple[str, ...],
-    said: torch.Tensor,
-    maps: torch.Tensor,
-    values: torch.Tensor,
-    weight: torch.Tensor,
-    velocity: torch.Tensor,
-) -> tuple[torch.Tensor, dict[str, float]]:
-    """L1 of the further branch: of the overlap that the boxes really have, and of velocities where they are known.
-
-    Args:
-        extras: What the branch says, of `network.EXTRAS`.
-        said: Its maps, shape (n, extras, H, W).
-        maps: As in `loss`, as are values and weight.
-        values: Shape (n, regression, H, W).
-        weight: Shape (n, H, W).
-        velocity: Shape (n, 2, H, W), NaN where unknown.
-    """
-    said, total, parts = said.float(), maps.new_zeros((), dtype=torch.float32), {}
-    for k, name in enumerate(extras):
-        if name == "iou":
-            with torch.no_grad():
-                wanted = 2.0 * overlap(maps[:, len(HEAD_CLASSES) :].float(), values) - 1.0
-        else:
-            wanted = velocity[:, 0 if name == "vx" else 1]
-        known = weight * torch.isfinite(wanted)
-        off = ((said[:, k] - torch.nan_to_num(wanted)).abs() * known).sum() / known.sum().clamp(min=1.0)
-        total = total + off
-        parts[name] = float(off.detach())
-    return total, parts
