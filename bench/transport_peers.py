@@ -379,7 +379,23 @@ WAYS: dict[str, type[Way]] = {
 def _serve(way: str, name: str, size: int, count: int, queue: Any, ready: Any, begun: Any, result: Any) -> None:
     global _begun
     _begun = begun
-    result.send(WAYS[way].receive(name, size, count, queue, ready))
+    since = _Since(ready)
+    result.send((WAYS[way].receive(name, size, count, queue, since), since.share()))
+
+
+class _Since:
+    """The event of a child that is ready, and what it takes of a core from then on."""
+
+    def __init__(self, ready: Any) -> None:
+        self._ready = ready
+        self._cpu = self._wall = 0
+
+    def set(self) -> None:
+        self._cpu, self._wall = time.process_time_ns(), now()
+        self._ready.set()
+
+    def share(self) -> float:
+        return (time.process_time_ns() - self._cpu) / (now() - self._wall)
 
 
 @contextmanager
@@ -435,7 +451,7 @@ one.send(b"".join(time.to_bytes(8, "little") for time in times))
         self._process.wait()
 
 
-def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarray, np.ndarray]:
+def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Sends data by one way to a child, and between them bare messages to another.
 
     Args:
@@ -446,7 +462,8 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
 
     Returns:
         For each that came, from its publication to the start of the receiver's code, and from before it was written to
-        there [ns], shape (n, 2), int64; and what the bare messages took [ns], shape (count,), int64.
+        there [ns], shape (n, 2), int64; what the bare messages took [ns], shape (count,), int64; and how much of a core
+        the receiver took meanwhile.
 
     Raises:
         TimeoutError: The child does not come, or data are missing.
@@ -472,8 +489,8 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
                     time.sleep(LOOK)
             if not result.poll(PATIENCE):
                 raise TimeoutError(f"{way}: not all of {count} data of {size} bytes have arrived")
-            times = result.recv()
-        return np.array(times, np.int64).reshape(-1, 2), bare.end()
+            times, share = result.recv()
+        return np.array(times, np.int64).reshape(-1, 2), bare.end(), share
     finally:
         bare.close()
         if sender is not None:
