@@ -29,6 +29,7 @@ from .expecting import Expectation
 from .places import connect, peer_of
 from .slabs import Region
 from .wire import (
+    COMMIT,
     ENDS,
     LEAVES,
     MESSAGE,
@@ -74,15 +75,24 @@ class _Connection:
         self.region = region
         self.writer = writer
         self._waiting: deque[bytes] = deque()
-        self.scratch = scratch
-        """Takes in rehearsals what the topic's window takes otherwise."""
-        self.rehearsals = 0
+        self._scratch = scratch  # takes in rehearsals what the topic's window takes otherwise
+        self._rehearsals = 0
         self.busy = False
         """While a datum is being read, it is told afterwards which slabs are no longer needed."""
 
     def __del__(self) -> None:
         # Whose slabs are let go of one by one after the end of receiving, and with the last of them the socket.
         self.socket.close()
+
+    def rehearse(self, event: Event, value: Any) -> None:
+        """Commits to where nobody sees it."""
+        self._rehearsals += 1
+        publish(self._scratch, event._replace(epoch=0, version=self._rehearsals, newest=True), value)
+
+    def forget_rehearsals(self) -> None:
+        """Lets go of the last of them, which else kept the memory for as long as the garbage collector leaves it."""
+        if self._rehearsals:
+            self.rehearse(Event(COMMIT, 0, 0, 0, 0, 0), None)
 
     def end(self, *words: int) -> None:
         """Receives no more; the writer leaves alone what is held."""
@@ -198,6 +208,7 @@ class Importer:
                     self._connection = self._socket = None
                     if gone:
                         connection.socket.close()
+                connection.forget_rehearsals()
                 del connection
 
     def _connect(self) -> _Connection | None:
@@ -387,10 +398,8 @@ def _rehearse(connection: _Connection, data: bytes) -> None:
     """Does with the last commit what is to be done with the next, to no effect."""
     event = read_event(data, connection.region.size)
     if not event.body_size:
-        connection.rehearsals += 1
         with suppress(ValueError):  # the memory may hold something else by now
-            value = _value(connection.region, event, _let_go_of_nothing)
-            publish(connection.scratch, event._replace(epoch=0, version=connection.rehearsals, newest=True), value)
+            connection.rehearse(event, _value(connection.region, event, _let_go_of_nothing))
 
 
 def _let_go_of_nothing(offset: int) -> None:

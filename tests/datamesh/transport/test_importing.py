@@ -1,7 +1,9 @@
 """The reader's side: the same windows, triggers, epochs, settles and misses as in the producer's own process."""
 
+import gc
 import logging
 import os
+import pathlib
 import socket
 import threading
 import time
@@ -327,6 +329,34 @@ class TestRehearsals:
         assert reader.commits["topic"] == [(0, version, True) for version in range(1, 6)]
         assert reader.mesh.losses["topic", "replaced"] == 0
         writer.until(lambda counts: counts["slabs"] <= 2 + 2, "topic", "the slabs of both windows")
+
+    def test_they_do_not_keep_the_memory_of_a_writer_that_is_gone(self, side, monkeypatch):
+        def memories():
+            """Those that the reader has mapped; the writers, in this process too, map theirs to write."""
+            lines = [line.split() for line in pathlib.Path("/proc/self/maps").read_text().splitlines()]
+            return {line[4] for line in lines if line[1] == "r--s" and "memfd:warploom" in line[-2]}
+
+        rehearsed, others = [], memories()
+        monkeypatch.setattr(exporting, "_COLD_NS", -1)
+        monkeypatch.setattr(importing, "_SHORT_NS", -1)
+        monkeypatch.setattr(importing, "_rehearse", lambda *_, of=importing._rehearse: rehearsed.append(of(*_)))
+        reader = side("reader", imports=["topic"], capacity=1)
+        gc.disable()  # as between two of its full passes, which may be minutes
+        try:
+            for life in range(4):
+                writer = side("writer", exports=["topic"], capacity=1)
+                writer.until(lambda counts: counts["readers"] == 1, "topic")
+                for number in range(1, 4):
+                    writer.commit("topic", 10 * life + number, lambda change: change.array(2000, np.int64))
+                    reader.until_shown(10 * life + number)
+                writer.links.stop()
+                writer.mesh.window("topic").new_epoch()
+                writer.mesh.window("topic").new_epoch()
+                reader.until(lambda counts: not counts["connected"], "topic")
+            assert len(rehearsed) >= 4
+            reader.wait(lambda: len(memories() - others) <= 1)  # that of what its window shows
+        finally:
+            gc.enable()
 
     def test_one_that_fails_costs_nothing(self, side, impostor):
         """What the last one refers to may hold something else by now."""
