@@ -62,7 +62,8 @@ class Backlog:
         # A queue in C wakes its thread in half the time that a condition does.
         self._wakes: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._sleepers = 0
-        self._closed = False
+        self.closed = False
+        """Whether it takes nothing more."""
 
     def __len__(self) -> int:
         return len(self.waiting)
@@ -77,7 +78,7 @@ class Backlog:
         dropped: Trigger | None = None
         reason = "backlog"
         with self._lock:
-            if trigger.settled or self._frames >= self._depth or self._closed:
+            if trigger.settled or self._frames >= self._depth or self.closed:
                 dropped, reason = self._make_room(trigger)
             wakes = False
             if dropped is not trigger:
@@ -95,11 +96,11 @@ class Backlog:
 
     def _make_room(self, trigger: Trigger) -> tuple[Trigger | None, str]:
         """Makes room, or waits for it: what is dropped, and why. Called with the lock held."""
-        while self._blocks and not trigger.settled and self._frames >= self._depth and not self._closed:
+        while self._blocks and not trigger.settled and self._frames >= self._depth and not self.closed:
             if self.gives_way():
                 return None, "backlog"
             self._room.wait()
-        if self._closed:
+        if self.closed:
             return trigger, "shutdown"
         if trigger.settled:
             full = len(self.waiting) - self._frames >= _SETTLED
@@ -123,7 +124,7 @@ class Backlog:
             with self._lock:
                 if self.waiting:
                     continue
-                if self._closed:
+                if self.closed:
                     return None
                 self._sleepers += 1
             self._wakes.get()
@@ -151,7 +152,7 @@ class Backlog:
     def close(self) -> None:
         """Takes nothing more; what waits can still be taken."""
         with self._lock:
-            self._closed = True
+            self.closed = True
             self._room.notify_all()
             sleepers, self._sleepers = self._sleepers, 0
         for _ in range(sleepers):
@@ -160,4 +161,4 @@ class Backlog:
     def open(self) -> None:
         """Takes triggers again."""
         with self._lock:
-            self._closed = False
+            self.closed = False

@@ -205,7 +205,7 @@ class DataProcessComponent(Component):
         inputs = {name: self.inputs[name] for name in config.inputs}
         # Inline it runs when the commit is through: no other one to the topic waits for it.
         self._runs_later = self._inline and backlog.policy != "block" and bool(inputs)
-        offer, after = (self.backlog.offer, self._advance) if self._runs_later else (self._offer, None)
+        offer, after = (self._takes_within_commit(), self._advance) if self._runs_later else (self._offer, None)
         self._windows = {name: one.window for name, one in inputs.items()}
         if config.any:
             self._source = AnyTrigger(inputs, offer, after)
@@ -251,6 +251,11 @@ class DataProcessComponent(Component):
         """
         self._offer(trigger)
         self._advance()
+
+    def _takes_within_commit(self) -> Callable[[Trigger], object]:
+        """What takes a trigger while others cannot commit, where `_advance` is called as soon as they can."""
+        assert self.backlog is not None
+        return self.backlog.offer
 
     def _offer(self, trigger: Trigger) -> None:
         assert self.backlog is not None

@@ -114,15 +114,43 @@ class DagComponent(DataProcessComponent):
     def _is_busy(self) -> bool:
         return self._free == 0 or bool(self.backlog and self.backlog.waiting)
 
+    def _takes_within_commit(self) -> Callable[[Trigger], object]:
+        return self._offer
+
+    def _offer(self, trigger: Trigger) -> None:
+        backlog, inline = self.backlog, self._inline
+        assert backlog is not None
+        # The usual case, a frame that need not wait, goes past the backlog: between commit and start each call counts.
+        if self._free > 0 and not trigger.settled and self._submitting.acquire(False):
+            passes = self._free > 0 and not backlog.waiting and not backlog.closed
+            try:
+                if passes:
+                    if backlog.on_taken is not None:
+                        backlog.on_taken(trigger)
+                    self._submit(trigger, inline)
+            except Exception:
+                self._could_not_start(trigger)
+            finally:
+                self._submitting.release()
+            if passes:
+                if inline and not self._runs_later:
+                    self._advance()
+                elif self._stopping:
+                    self._wake_stop()
+                return
+        if backlog.offer(trigger) is not trigger and not self._runs_later:
+            self._advance()
+
     def _advance(self) -> None:
-        self._submit_waiting(serves=self._inline)
+        assert self.backlog is not None
+        if self.backlog.waiting or self._stopping:
+            self._submit_waiting(serves=self._inline)
         if self._inline and self._engine is not None:
             self._engine.serve()
 
     def _submit_waiting(self, *, serves: bool) -> None:
         """Submits what waits, while there is room in the graph; who calls says whether it serves the graph next."""
         assert self.backlog is not None
-        assert self._engine is not None
         while self.backlog.waiting and self._free > 0:
             with self._submitting:  # frames enter in their order
                 # While no slot is free, triggers wait in the backlog, where its policy rules.
@@ -132,47 +160,47 @@ class DagComponent(DataProcessComponent):
                 try:
                     self._submit(trigger, serves)
                 except Exception:
-                    self.log.exception("%s could not start at version %d", self.name, trigger.version)
-                    self.losses.count(self.name, "failed", trigger.version)
-                    self.settle(trigger.version, trigger.epoch)
+                    self._could_not_start(trigger)
         if self._stopping:
-            with self._idle:
-                self._idle.notify_all()
+            self._wake_stop()
+
+    def _could_not_start(self, trigger: Trigger) -> None:
+        self.log.exception("%s could not start at version %d", self.name, trigger.version)
+        self.losses.count(self.name, "failed", trigger.version)
+        self.settle(trigger.version, trigger.epoch)
+
+    def _wake_stop(self) -> None:
+        with self._idle:
+            self._idle.notify_all()
 
     def _submit(self, trigger: Trigger, serves: bool) -> None:
         """Starts the graph for a trigger, or settles it. Called by one thread at a time."""
-        assert self._engine is not None
-        data = None if trigger.settled else self._data(trigger)
-        if data is None:
+        if trigger.settled:
             self.settle(trigger.version, trigger.epoch)
             return
+        data, given = {}, self._given and self._given.pop((trigger.epoch, trigger.version), None)
+        for name, version in trigger.inputs.items():
+            state = self._windows[name].state
+            if given:
+                entry = given[name]
+            elif state.epoch == trigger.epoch and state.versions and state.versions[-1] == version:
+                entry = state.entries[-1]  # the usual case, without a call
+            else:
+                entry = self._windows[name].find(version, trigger.epoch)
+            if entry is None:
+                miss = self._windows[name].snapshot(trigger.epoch).miss(version)
+                self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
+                self.settle(trigger.version, trigger.epoch)
+                return
+            written = entry.completion is None
+            data[name] = entry.value if written else entry.read(getattr(self.context, "stream", None))
         with self._slots:
             self._free -= 1
         deadline = None
         if self._deadline is not None:
             deadline = FrameDeadline(self._deadline, trigger, self.clock, self.settle)
+        assert self._engine is not None
         self._engine.submit(trigger, data, self._done, deadline, serves=serves)
-
-    def _data(self, trigger: Trigger) -> dict[str, Any] | None:
-        """The data that triggered, by input; None, counted, where they are gone."""
-        data: dict[str, Any] = {}
-        epoch = trigger.epoch
-        given = self._given.pop((epoch, trigger.version), None) if self._given else None
-        for name, version in trigger.inputs.items():
-            state = self._windows[name].state
-            if given is not None:
-                entry = given[name]
-            elif state.epoch == epoch and state.versions and state.versions[-1] == version:
-                entry = state.entries[-1]  # the usual case, without a call
-            else:
-                entry = self._windows[name].find(version, epoch)
-            if entry is None:
-                miss = self._windows[name].snapshot(trigger.epoch).miss(version)
-                self.losses.count(self.name, f"trigger {miss.value if miss else 'missing'}", trigger.version)
-                return None
-            written = entry.completion is None
-            data[name] = entry.value if written else entry.read(getattr(self.context, "stream", None))
-        return data
 
     def _done(self, run: Run) -> None:
         trigger = run.trigger

@@ -224,9 +224,13 @@ class GraphEngine:
                     vertex.running = vertex.queue.popleft()
                     self._ready.append((vertex, vertex.running, False))
                     ready += 1
-            wakes = self._claim(ready - serves) if ready > serves else 0
-        for _ in range(wakes):
+            ready -= serves
+            wakes = ready if ready < self._sleepers else self._sleepers
+            if wakes > 0:
+                self._sleepers -= wakes
+        while wakes > 0:
             self._wakes.put(None)
+            wakes -= 1
 
     def _offer(self, vertex: Vertex) -> int:
         """Makes the vertex's next frame ready to run if both are; gives how many it made. Called with the lock held."""

@@ -3,7 +3,7 @@
 import threading
 
 import pytest
-from component_parts import WAIT, Holding, dag, doubler
+from component_parts import BLOCK, FIFO, WAIT, Holding, dag, doubler, same
 
 from warploom.dag import BacklogConfig
 from warploom.datamesh import CommitPolicy, DataMesh, Entry, Status
@@ -94,3 +94,53 @@ def test_inline_a_chain_runs_through_without_deep_recursion(topic):
     component.stop()
     assert result.events == list(range(500))
     assert mesh.losses.as_dict() == {}
+
+
+@pytest.mark.parametrize("backlog", [FIFO, BLOCK], ids=["fifo", "block"])
+@pytest.mark.parametrize("hand_off", ["inline", "thread"])
+def test_what_is_committed_while_a_graph_stops_is_run_or_settled(hand_off, backlog, topic):
+    mesh = DataMesh(window_capacity=64)
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = dag(mesh, same, hand_off=hand_off, backlog=backlog, workers=2, in_flight=2)
+    component.stop_timeout_s = WAIT
+    stops, committed = 15, []
+
+    def commit():
+        while not ended.is_set():
+            committed.append(len(committed))
+            given.commit(committed[-1], committed[-1])
+
+    for number in range(stops):
+        ended = threading.Event()
+        component.start()
+        producer = threading.Thread(target=commit)
+        producer.start()
+        result.wait_for(len(committed) + number % 7)
+        component.stop()
+        ended.set()
+        producer.join(WAIT)
+    losses = mesh.losses.as_dict().get("dag", {})
+    assert sorted(result.events) == committed
+    assert len(result.settled) == sum(losses.values())
+    assert set(losses) <= {"shutdown", "backlog", "trigger evicted"}, "the producer runs on, over what waits"
+    assert sorted(result.entries) == list(result.entries), "frames enter in their order"
+
+
+def test_a_frame_that_need_not_wait_is_told_of_as_taken_and_one_that_cannot_start_is_settled(topic, started):
+    mesh, taken = DataMesh(), []
+    given, result = topic(mesh.window("input")), topic(mesh.window("output"))
+    component = dag(mesh, same)
+
+    def on_taken(trigger):
+        taken.append(trigger.version)
+        if trigger.version == 2:
+            raise OSError("it cannot be noted")
+
+    component.backlog.on_taken = on_taken
+    started(component)
+    for version in (1, 2, 3):
+        given.commit(version, version)
+        result.wait_for(version)
+    assert taken == [1, 2, 3]
+    assert result.settled == [2]
+    assert mesh.losses.as_dict() == {"dag": {"failed": 1}}
