@@ -150,7 +150,7 @@ def _describe_mcap(path: pathlib.Path) -> dict[str, object]:
         "kind": "MCAP recording",
         "messages": statistics.message_count,
         "duration [s]": round((statistics.message_end_time - statistics.message_start_time) * 1e-9, 3),
-        "first version [ns]": statistics.message_start_time,
+        "first log time [ns]": statistics.message_start_time,
         "compression": sorted({index.compression or "none" for index in summary.chunk_indexes}),
         "topics": topics,
     }

@@ -1,4 +1,5 @@
 import json
+import time
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from hypothesis import strategies as st
 from warploom.components.messages import Obstacles
 from warploom.components.sinks import JsonLinesSink, McapSink
 from warploom.components.sources import describe, describe_lines
+from warploom.datamesh import CommitPolicy, DataMesh, Entry
+from warploom.datamesh.recording import Recorder
 from warploom.errors import SourceError
 
 
@@ -71,6 +74,16 @@ def test_a_recording_and_its_objects_are_described(tmp_path):
     description = describe(tmp_path / "objects.jsonl")
     assert (description["frames"], description["objects"], description["tracks"]) == (4, 4, 1)
     assert description["classes"]["vehicle"] == 4
+
+
+def test_a_time_of_a_recording_is_called_what_it_is(tmp_path):
+    mesh, before = DataMesh(), time.time_ns()
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        recorder.watch(mesh, ["number"])
+        mesh.window("number").commit(CommitPolicy.DISCARD_OUT_OF_ORDER, Entry(7, 1, 0, mesh.clock.monotonic_ns()))
+    description = describe(tmp_path / "run.mcap")
+    assert description["first log time [ns]"] >= before, "of the wall clock, where the version is 7"
+    assert "first version [ns]" not in description
 
 
 @given(st.integers(0, 3000))
