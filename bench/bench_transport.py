@@ -12,7 +12,7 @@ GOAL = 200.0  # [µs] of the median, whatever the size
 EVERY = 4e-3  # [s] from one to the next: the receiver sleeps, and what it needs leaves the processor's caches
 COUNT, COUNT_OF_LONG = 100, 30
 PACES = {"1 kHz": (1e-3, 200), "10 Hz": (0.1, 20)}  # [s] from one to the next, and how many
-PACED = ("warploom", "warploom, hand_off: thread", "zenoh", "iceoryx2", "POSIX shared memory")
+PACED = ("warploom", "warploom, spin_us: 0", "zenoh", "iceoryx2", "POSIX shared memory")
 
 
 @pytest.mark.parametrize("way", [*WAYS, "dora-rs"])

@@ -124,10 +124,12 @@ def start_all(start: Start) -> None:
     """
     from ..components.launching import monitor_processes, plan_launch
 
-    if bool(start.file) == bool(start.hardware):
+    # A folder that was assembled for a node names it so to its `start_all`, which may be given options all the same.
+    file = start.file or (None if start.hardware else os.environ.get("WARPLOOM_LAUNCH"))
+    if bool(file) == bool(start.hardware):
         raise typer.BadParameter("say what to start: a launch file, or --hw, --lidar, --camera, --radar")
     planned = plan_launch(
-        start.file,
+        file,
         hardware=start.hardware,
         profile=start.profile,
         settings=start.settings or (),

@@ -45,10 +45,9 @@ PYTHONPATH="$here/lib" PYTHONNOUSERSITE=1 exec "${{WARPLOOM_PYTHON:-{python}}}" 
 """
 _START_ALL = """\
 #!/bin/sh
-# Starts every process of a node, and the monitors beside them; without arguments {node}.
+# Starts every process of a node, and the monitors beside them; of {node} where no other is named.
 here=$(CDPATH= cd -- "$(dirname -- "$(readlink -f -- "$0")")/.." && pwd)
-[ $# -gt 0 ] || set -- {node}
-exec "$here/bin/warploom" start-all "$@"
+WARPLOOM_LAUNCH={node} exec "$here/bin/warploom" start-all "$@"
 """
 _LAUNCHER = """\
 #!/bin/sh

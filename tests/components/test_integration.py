@@ -135,6 +135,12 @@ def test_its_commands_answer_outside_the_checkout(folder, environment, tmp_path)
     done = run(folder, "start_all", "--hw", "hw51", environment=environment, cwd=tmp_path)
     assert done.returncode == 2
     assert "--hw hw50 --lidar pandar90 --camera 13 --radar conti430" in done.stderr
+    done = run(folder, "start_all", "--check", "--skip-check", "memory", environment=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"node {NODE!r} is good" in done.stdout, "options name no other node"
+    done = run(folder, "start_all", "--check", "nothing.launch.yaml", environment=environment, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "nothing.launch.yaml" in done.stderr
 
 
 def test_it_is_made_anew_in_its_own_folder_and_in_no_other(tmp_path):
