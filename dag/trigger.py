@@ -49,6 +49,9 @@ class TriggerConfig(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _name_of_an_input(cls, value: Any) -> Any:
+        if not isinstance(value, (str, Mapping, TriggerConfig)):
+            forms = "the name of an input, {any: [a, b]}, {all: [a, b]} or {period_ms: 100}"
+            raise ValueError(f"a trigger is {forms}, not {value!r}")
         return {"any": (value,) if value else ()} if isinstance(value, str) else value
 
     @model_validator(mode="after")

@@ -29,6 +29,8 @@ def test_a_trigger_is_an_input_or_some_or_a_time(given, inputs, period):
         ({"all": ["a"], "overrun": "coalesce"}, "overrun belongs to a trigger with period_ms"),
         ({"period_ms": 0}, "greater than 0"),
         ({"all": ["a"], "tolerance_ms": -1}, "greater than or equal to 0"),
+        (["a", "b"], "the name of an input, {any: [a, b]}, {all: [a, b]} or {period_ms: 100}, not ['a', 'b']"),
+        (100, "or {period_ms: 100}, not 100"),
         ({"every": 3}, "Extra inputs are not permitted"),
         ({"period_ms": 5, "overrun": "burst"}, "'skip' or 'coalesce'"),
     ],
