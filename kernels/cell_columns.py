@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from .cell_pairs import Radius, cell_of, is_finite
-from .column_sort import LEFT_OUT, bits_for, sort_cells
+from .column_sort import LAYOUT, LEFT_OUT, bits_for, sort_cells
 from .device import DEFAULT_DEVICE
 from .parts import part_start
 from .threads import PackedLaunch, launch_parts, thread_count
@@ -182,13 +182,18 @@ class CellColumns:
         self._find_cells = self.packed(
             _find_cells, [None, None, None, 0, radius], [cells, self.cell_of_point, self.point_count]
         )
-        words = bits_for(capacity, self.parts)
+        words = bits_for(capacity, self.parts) + 1
+        self.bits = [
+            *(buffer((self.parts, words), wp.uint64), buffer((self.parts, words)), buffer(capacity + self.parts)),
+            buffer((self.parts, LAYOUT)),
+        ]
+        """Where columns are, for `FIND_COLUMNS`."""
         self._sort_cells = self.packed(
             sort_cells,
             [None, cells, self.point_count, int(radius.per_metre > 0)],
             [
                 *(buffer(), buffer(), buffer(dtype=wp.uint64), buffer(), buffer(capacity + self.parts)),
-                *(buffer((self.parts, words), wp.uint64), buffer((self.parts, words))),
+                *self.bits,
                 *(self.order, self.cell_of_point, self.points, self.stacks, self.columns, self.ranges),
             ],
         )

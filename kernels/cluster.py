@@ -22,7 +22,7 @@ from .cluster_columns import JoinedColumns
 from .cluster_labels import label_points
 from .cluster_levels import join_levels_in_order
 from .device import DEFAULT_DEVICE, resolve_device
-from .interop import borrow_points, count_on, give
+from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
 from .threads import PackedLaunch
 
@@ -145,12 +145,12 @@ class EuclideanCluster:
             by_cell = CellColumns(self._radius, self.capacity, ordered=False)
             keep("_by_cell", by_cell)
             columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
-            joined = JoinedColumns(by_cell, *columns, self._radius)
+            joined = JoinedColumns(by_cell, *columns, self._radius, by_cell.bits)
             keep("_joined", joined)
             cells = self.capacity + by_cell.parts
             members = wp.empty(cells, dtype=wp.int32, device=device)
             given = [by_cell.ranges, by_cell.stacks, by_cell.cell_of_point, by_cell.point_count, self.min_size]
-            labelled = [joined.parent, members, self.labels, self.cluster_count]
+            labelled = [joined.parent, members, None, self.cluster_count]
             keep("_label", PackedLaunch(label_points, None, given, labelled))
             if self.radius_per_metre > 0:
                 slots = 2 << (self.capacity - 1).bit_length()
@@ -171,6 +171,9 @@ class EuclideanCluster:
             count: Shape (1,), int32.
             include: Shape (n or more,), bool or uint8: where it is zero, a point takes no part and gets the label -1.
         """
+        self._launch(xyz, count, include, self.labels)
+
+    def _launch(self, xyz: wp.array, count: wp.array, include: wp.array | None, labels: wp.array) -> None:
         n = xyz.shape[0]
         if n > self.capacity:
             raise ValueError(f"xyz has {n} rows, more than the plan's capacity of {self.capacity}")
@@ -181,14 +184,14 @@ class EuclideanCluster:
                 raise ValueError(f"include must be bool or uint8 with at least {n} rows, as there are points")
             mask, has_include = include.view(wp.uint8) if include.dtype == wp.bool else include, 1
         if self._sequential:
-            self._launch_in_order([xyz, count, mask, has_include])
+            self._launch_in_order([xyz, count, mask, has_include], labels)
         elif n == 0:
             self.cluster_count.zero_()
         else:
             self._by_cell.launch(xyz, count, mask, has_include)
-            self._launch_shared(n)
+            self._launch_shared(n, labels)
 
-    def _launch_in_order(self, given: list) -> None:
+    def _launch_in_order(self, given: list, labels: wp.array) -> None:
         by_cell, joined = self._by_cell, self._joined
         by_cell.launch(*given)
         joined.launch()
@@ -204,9 +207,9 @@ class EuclideanCluster:
                 ],
                 device=self.device,
             )
-        self._label.launch()
+        self._label.launch(labels_out=labels)
 
-    def _launch_shared(self, n: int) -> None:
+    def _launch_shared(self, n: int, labels: wp.array) -> None:
         by_cell, radius = self._by_cell, self._radius
         parent, cell_count = by_cell.parent, by_cell.cell_count
         cell_size, cell_begin = by_cell.cell_size[:n], by_cell.cell_begin
@@ -222,7 +225,7 @@ class EuclideanCluster:
             wp.utils.array_scan(cell_size, self._cell_end[:n], inclusive=True)
             inputs = [*found, by_cell.cells, cell_begin, self._cell_end, by_cell.points, cell_count, radius]
             run(_join_levels, inputs, [parent])
-        by_cell.label(n, self.min_size, self.labels, self.cluster_count)
+        by_cell.label(n, self.min_size, labels, self.cluster_count)
 
 
 def cluster(
@@ -270,5 +273,10 @@ def cluster(
         capacity=capacity_for(n),
         device=borrowed.device,
     )
-    plan.launch(borrowed.xyz, count_on(n, borrowed.device))
-    return give(plan.labels[:n], borrowed.family)
+    count = count_on(n, borrowed.device)
+    if n == 0 or borrowed.device != DEFAULT_DEVICE:
+        plan.launch(borrowed.xyz, count)
+        return give(plan.labels[:n], borrowed.family)
+    host = np.empty(n, np.int32)  # the caller's own: to copy them would take as long again as to write them
+    plan._launch(borrowed.xyz, count, None, wp.array(host, copy=False, device=DEFAULT_DEVICE))
+    return adopt(host, borrowed.family)

@@ -11,11 +11,14 @@ the columns at the borders between the parts, which are few.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import warp as wp
 
 from .cell_columns import CellColumns
 from .cell_pairs import TOUCH, Radius
 from .column_neighbors import NEAR_COLUMNS
+from .column_sort import FIND_COLUMNS
 from .device import DEFAULT_DEVICE
 from .threads import PackedLaunch
 
@@ -31,6 +34,7 @@ _JOIN_OWN = (
     "#ifndef __CUDA_ARCH__  // for CPUs alone"
     + TOUCH
     + NEAR_COLUMNS
+    + FIND_COLUMNS
     + """
     constexpr int LANES = 8, MOST_TESTS = 1024;  // of eight pairs, until crowds are narrowed to what lies between them
     typedef float Eight __attribute__((ext_vector_type(8)));
@@ -50,9 +54,17 @@ _JOIN_OWN = (
     const auto bits_of = [](const EightOf answers) {
         return (unsigned)__builtin_bit_cast(unsigned char, __builtin_convertvector(answers, EightBits));
     };
-    const auto squared_gap = [](const Eight over, const Eight under) {
-        const Eight gap = __builtin_elementwise_max(__builtin_elementwise_max(over, under), (Eight)0.0f);
+    // Of finite numbers; the built-in functions for these also see to those that are not.
+    const auto least_of = [](const auto a, const auto b) { return a < b ? a : b; };
+    const auto most_of = [](const auto a, const auto b) { return a > b ? a : b; };
+    const auto squared_gap = [&](const Eight over, const Eight under) {
+        const Eight gap = most_of(most_of(over, under), (Eight)0.0f);
         return gap * gap;
+    };
+    const auto along_all = [](const Eight eight, const auto& pick) {
+        const auto four = pick(eight.lo, eight.hi);
+        const auto two = pick(four.lo, four.hi);
+        return pick((float)two.x, (float)two.y);
     };
     const vec4i* __restrict column = columns.data;
     const vec2i* __restrict stack = stacks.data;
@@ -89,22 +101,28 @@ _JOIN_OWN = (
     }
     segment_of[end] = ++segments;
     cell_of[segments] = last_cell;
+    const float* __restrict rows = (const float*)point;
+    float* __restrict lane[3] = {lanes_of(coordinates, 0), lanes_of(coordinates, 1), lanes_of(coordinates, 2)};
+    for (int i = stack[first_cell][1]; i < stack[last_cell][1]; ++i) {
+        lane[0][i] = rows[3ll * i];
+        lane[1][i] = rows[3ll * i + 1];
+        lane[2][i] = rows[3ll * i + 2];
+    }
+    const EightOf LANE = {0, 1, 2, 3, 4, 5, 6, 7};
     for (int s = first_cell; s < segments; ++s) {
         const int first = stack[cell_of[s]][1], last = stack[cell_of[s + 1]][1];
         start_of[s] = first;
         above[s] = s;
-        vec3 least = point[first], most = least;
-        for (int i = first; i < last; ++i) {
-            for (int axis = 0; axis < 3; ++axis) {
-                const float here = point[i][axis];
-                lanes_of(coordinates, axis)[i] = here;
-                least[axis] = here < least[axis] ? here : least[axis];
-                most[axis] = here > most[axis] ? here : most[axis];
-            }
-        }
         for (int axis = 0; axis < 3; ++axis) {
-            lanes_of(boxes, axis)[s] = least[axis];
-            lanes_of(boxes, axis + 3)[s] = most[axis];
+            Eight least = point[first][axis], most = least;
+            for (int i = first; i < last; i += LANES) {
+                const EightOf own = LANE < last - i;
+                const Eight here = own ? eight(along[axis] + i) : least;
+                least = least_of(least, here);
+                most = most_of(most, own ? here : most);
+            }
+            lanes_of(boxes, axis)[s] = along_all(least, least_of);
+            lanes_of(boxes, axis + 3)[s] = along_all(most, most_of);
         }
     }
     start_of[segments] = stack[last_cell][1];
@@ -171,15 +189,30 @@ _JOIN_OWN = (
     };
 
     // A segment and those after it: up to eight of each row at once.
-    NearColumns own_row{column, end, 0, 2, begin, begin};
-    NearColumns next_row{column, end, 1, 2, begin, begin}, second_row{column, end, 2, 2, begin, begin};
+    NearColumns rows_on[3] = {
+        {column, end, 0, 2, begin, begin}, {column, end, 1, 2, begin, begin}, {column, end, 2, 2, begin, begin}};
+    const long long bits_from = (long long)part * words.shape[1];
+    const int* layout = layouts.data + part * layouts.shape[1];
+    const bool by_bits = layouts.data != nullptr && layout[0] > 0;
+    const ColumnsByBits bits{
+        (const unsigned long long*)words.data + bits_from, ranks.data + bits_from,
+        block_columns.data + (by_bits ? layout[6] : 0), layout};
     for (int k = begin; k < end; ++k) {
-        own_row.move_to(k);
-        next_row.move_to(k);
-        second_row.move_to(k);
-        int from[3] = {0, segment_of[next_row.first], segment_of[second_row.first]};
-        const int to[3] = {segment_of[own_row.last], segment_of[next_row.last], segment_of[second_row.last]};
-        if (grows) set_level((column[k][0] + (1 << 18)) >> 19);
+        const int level = grows ? (column[k][0] + (1 << 18)) >> 19 : 0;
+        int near_from[3], near_to[3];
+        if (by_bits) {
+            for (int row = 0; row < 3; ++row)
+                bits.find(column[k][0], column[k][1], level, row, near_from[row], near_to[row]);
+        } else {
+            for (int row = 0; row < 3; ++row) {
+                rows_on[row].move_to(k);
+                near_from[row] = rows_on[row].first;
+                near_to[row] = rows_on[row].last;
+            }
+        }
+        int from[3] = {0, segment_of[near_from[1]], segment_of[near_from[2]]};
+        const int to[3] = {segment_of[near_to[0]], segment_of[near_to[1]], segment_of[near_to[2]]};
+        if (grows) set_level(level);
         for (int s = segment_of[k]; s < segment_of[k + 1]; ++s) {
             from[0] = s + 1;
             unsigned near = 0;
@@ -220,6 +253,10 @@ def _join_own(
     stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
     radius: Radius,
+    words: wp.array2d(dtype=wp.uint64),
+    ranks: wp.array2d(dtype=wp.int32),
+    block_columns: wp.array(dtype=wp.int32),
+    layouts: wp.array2d(dtype=wp.int32),
     first_segment: wp.array(dtype=wp.int32),
     segment_cell: wp.array(dtype=wp.int32),
     segment_start: wp.array(dtype=wp.int32),
@@ -241,6 +278,10 @@ def join_own_columns(
     stacks: wp.array(dtype=wp.vec2i),
     points: wp.array(dtype=wp.vec3),
     radius: Radius,
+    words: wp.array2d(dtype=wp.uint64),
+    ranks: wp.array2d(dtype=wp.int32),
+    block_columns: wp.array(dtype=wp.int32),
+    layouts: wp.array2d(dtype=wp.int32),
     # out: of each column its first segment; of each segment its first cell and point, one of its component, the lowest
     # x, y, z and the highest; the points' x, y and z
     first_segment: wp.array(dtype=wp.int32),
@@ -255,7 +296,7 @@ def join_own_columns(
     own = ranges[part]
     if own[2] < own[3]:
         _join_own(
-            part, own[0], own[1], own[2], own[3], columns, stacks, points, radius,
+            part, own[0], own[1], own[2], own[3], columns, stacks, points, radius, words, ranks, block_columns, layouts,
             first_segment, segment_cell, segment_start, segment_parent, boxes, coordinates, parent,
         )  # fmt: skip
 
@@ -349,8 +390,9 @@ class JoinedColumns:
         stacks: wp.array,
         points: wp.array,
         radius: Radius,
+        bits: Sequence[wp.array | None] = (None,) * 4,
     ):
-        """Makes it for columns such as `CellColumns` has; they may be those of some of its points."""
+        """Makes it for columns such as `CellColumns` has, and their `bits`; or for those of some of its points."""
         capacity = by_cell.points.shape[0]
         cells = capacity + by_cell.parts
 
@@ -362,7 +404,7 @@ class JoinedColumns:
         given = [ranges, columns, stacks, points, radius]
         own = [buffer(), buffer(), buffer(), buffer(cells + _LANES)]
         lanes = [buffer((6, cells + _LANES), wp.float32), buffer((3, capacity + _LANES), wp.float32)]
-        self._join = by_cell.packed(join_own_columns, given, [*own, *lanes, self.parent])
+        self._join = by_cell.packed(join_own_columns, [*given, *bits], [*own, *lanes, self.parent])
         self._join_borders = None
         if by_cell.parts > 1:
             self._join_borders = PackedLaunch(join_borders, None, given, [self.parent])

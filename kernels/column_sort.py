@@ -13,7 +13,7 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE  # noqa: F401  (starts Warp)
 
-__all__ = ["LEFT_OUT", "bits_for", "sort_cells"]
+__all__ = ["FIND_COLUMNS", "LAYOUT", "LEFT_OUT", "bits_for", "sort_cells"]
 
 # Which cell a point falls into must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
@@ -27,6 +27,35 @@ def bits_for(capacity: int, parts: int) -> int:
     """How many words of bits each part of a plan for up to `capacity` points has."""
     return min(max(_LEAST_WORDS, _WORDS_PER_POINT * capacity) // parts, _MOST_WORDS)
 
+
+LAYOUT = 7
+"""Numbers that say how a part's bits are laid out: words a row, or 0 where the cloud was too wide for bits; blocks a
+column, as a power of two; the lowest x, y and level; rows a level; and where the columns of its blocks are listed."""
+
+FIND_COLUMNS = """
+    // Columns by the bits that they were numbered by.
+    struct ColumnsByBits {
+        const unsigned long long* word;
+        const int *rank, *column_of, *layout;
+        // The first column of a part whose bit is not before `at`.
+        int from(const int at) const {
+            const unsigned long long before = word[at >> 6] & (((unsigned long long)1 << (at & 63)) - 1);
+            return column_of[rank[at >> 6] + __builtin_popcountll(before)];
+        }
+        // Those of a row, `dx` rows on, with y from y - 2 to y + 2: first, and one after the last.
+        void find(const int x, const int y, const int level, const int dx, int& first, int& last) const {
+            const int along = x - level * (1 << 19) - layout[2] + dx;
+            first = last = column_of[0];
+            if (along >= layout[5]) return;
+            const int row_bits = layout[0] * 64, shift = layout[1], near = y - layout[3];
+            const int row = ((level - layout[4]) * layout[5] + along) * row_bits;
+            const int low = near > 2 ? (near - 2) << shift : 0, high = (near + 3) << shift;
+            first = from(row + low);
+            last = from(row + (high < row_bits ? high : row_bits));
+        }
+    };
+"""
+"""C++: `ColumnsByBits near{words, ranks, columns, layout}` of a part, and `near.find(x, y, level, dx, first, last)`."""
 
 # Parts are cut by rows of columns, at the quantiles of a sample of the points.
 _SORT = """
@@ -100,6 +129,8 @@ _SORT = """
     }
     // A place is left free after a part's cells, for where the last one ends.
     const int first_cell = begin + part, end = begin + own;
+    int* __restrict layout = layouts.data + part * layouts.shape[1];
+    layout[0] = 0;
     if (own == 0) {
         ranges.data[part] = wp::vec4i(first_cell, first_cell, begin, begin);
         return;
@@ -124,7 +155,7 @@ _SORT = """
     int shift = 0;
     while (((long long)most[2] - least[2]) >> 6 >> shift > 0) ++shift;
     const double wide = (double)most[0] - least[0] + 1, deep = (double)most[1] - least[1] + 1;
-    if (wide * ((double)most[3] - least[3] + 1) * (deep * (1 << shift) / 64 + 1) > words_of.shape[1]) {
+    if (wide * ((double)most[3] - least[3] + 1) * (deep * (1 << shift) / 64 + 1) >= words_of.shape[1]) {
         // Too wide for bits. The order is found by as many digits of 11 bits as there are.
         int* from = list;
         int* to = blocks.data + begin;
@@ -195,6 +226,11 @@ _SORT = """
         rank[w] = occupied;
         occupied += popcount(word[w]);
     }
+    rank[words] = occupied;
+    word[words] = 0;
+    const int described[7] = {words_a_row, shift, least[0], least[1], least[3], width, begin + part};
+    for (int number = 0; number < 7; ++number) layout[number] = described[number];
+    int* __restrict column_of = block_columns.data + begin + part;
     for (int b = 0; b < occupied; ++b) mask[b] = 0;
     for (int m = 0; m < own; ++m) {
         const int at = block_of[m];
@@ -225,6 +261,7 @@ _SORT = """
                 const int y = (at >> shift) + least[1];
                 if (y != last_y) add_column(x, y);
                 last_y = y;
+                column_of[b] = k;
                 const int base = ((at & ((1 << shift) - 1)) << 6) + least[2];
                 for (Bits heights = mask[b]; heights != 0; heights &= heights - 1) {
                     stack[++c] = wp::vec2i(base + popcount((heights & (~heights + 1)) - 1), place);
@@ -236,6 +273,7 @@ _SORT = """
             }
         }
     }
+    column_of[occupied] = k + 1;
     for (int m = 0; m < own; ++m) put_point(next[block_of[m]]++, list[m]);
     stack[c + 1] = wp::vec2i(0, end);
     ranges.data[part] = wp::vec4i(first_cell, c + 1, begin, k + 1);
@@ -257,6 +295,8 @@ def _sort(
     next_places: wp.array(dtype=wp.int32),
     words_of: wp.array2d(dtype=wp.uint64),
     ranks: wp.array2d(dtype=wp.int32),
+    block_columns: wp.array(dtype=wp.int32),
+    layouts: wp.array2d(dtype=wp.int32),
     order: wp.array(dtype=wp.int32),
     cell_of_point: wp.array(dtype=wp.int32),
     points: wp.array(dtype=wp.vec3),
@@ -276,7 +316,8 @@ def sort_cells(
     cells: wp.array2d(dtype=wp.int32),
     point_count: wp.array(dtype=wp.int32),
     has_levels: int,
-    # out: for the sort's own use, by point, block of cells, cell and word of bits
+    # out: for the sort's own use, by point, block of cells, cell and word of bits; where columns are, as `FIND_COLUMNS`
+    # reads it
     list_of: wp.array(dtype=wp.int32),
     blocks: wp.array(dtype=wp.int32),
     masks: wp.array(dtype=wp.uint64),
@@ -284,6 +325,8 @@ def sort_cells(
     next_places: wp.array(dtype=wp.int32),
     words_of: wp.array2d(dtype=wp.uint64),
     ranks: wp.array2d(dtype=wp.int32),
+    block_columns: wp.array(dtype=wp.int32),
+    layouts: wp.array2d(dtype=wp.int32),
     # out: see `CellColumns`
     order: wp.array(dtype=wp.int32),
     cell_of_point: wp.array(dtype=wp.int32),
@@ -295,5 +338,5 @@ def sort_cells(
     """Sorts the points of a range of rows, and lists their cells and columns."""
     _sort(
         part, parts, xyz_in, cells, point_count, has_levels, list_of, blocks, masks, block_cells, next_places,
-        words_of, ranks, order, cell_of_point, points, stacks, columns, ranges,
+        words_of, ranks, block_columns, layouts, order, cell_of_point, points, stacks, columns, ranges,
     )  # fmt: skip

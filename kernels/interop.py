@@ -38,8 +38,6 @@ class Points:
 
     xyz: wp.array
     """Positions [m], shape (n,), dtype vec3, possibly strided."""
-    intensity: wp.array | None
-    """The fourth column, shape (n,), float32, possibly strided; None when there are only three."""
     table: wp.array
     """All columns, shape (n, C), float32."""
     family: Family
@@ -54,6 +52,11 @@ class Points:
         return self.family.device
 
     @property
+    def intensity(self) -> wp.array | None:
+        """The fourth column, shape (n,), float32, possibly strided; None when there are only three."""
+        return _column(self.table, 3, wp.float32) if self.table.shape[1] > 3 else None
+
+    @property
     def extra(self) -> wp.array:
         """The columns after the third, shape (n, C - 3), float32, possibly strided, possibly none."""
         n, columns = self.table.shape
@@ -64,6 +67,13 @@ class Points:
             strides=(self.table.strides[0], 4),
             device=self.table.device,
         )
+
+
+def _column(table: wp.array, first: int, dtype: type) -> wp.array:
+    """What begins at a column of a table, row by row."""
+    n = table.shape[0]
+    ptr = table.ptr + 4 * first if n else None
+    return wp.array(ptr=ptr, dtype=dtype, shape=(n,), strides=(table.strides[0],), device=table.device)
 
 
 @lru_cache(maxsize=64)
@@ -153,16 +163,7 @@ def borrow_points(points: Any, name: str = "points") -> Points:
     """
     family = family_of(points, name)
     table, owner = _float_table(points, family, name, columns=3)
-    n, columns = table.shape
-    stride = table.strides[0]
-
-    def column(offset: int, dtype: type) -> wp.array:
-        return wp.array(
-            ptr=table.ptr + offset if n else None, dtype=dtype, shape=(n,), strides=(stride,), device=table.device
-        )
-
-    intensity = column(12, wp.float32) if columns > 3 else None
-    return Points(column(0, wp.vec3), intensity, table, family, (owner, table))
+    return Points(_column(table, 0, wp.vec3), table, family, (owner, table))
 
 
 def borrow(array: Any, dtype: type, shape: tuple[int | None, ...], name: str) -> tuple[wp.array, Any]:

@@ -335,6 +335,21 @@ def test_no_point_and_one_point(n):
     assert labels.tolist() == [0] * n
 
 
+def test_labels_are_the_callers_own():
+    """A later call of the same size, which the same plan serves, leaves them alone."""
+    points, others = cloud(31), cloud(32)
+    labels = cluster(points, 0.8)
+    expected = reference(points, 0.8)
+    assert labels.dtype == np.int32
+    assert labels.flags.writeable
+    assert labels.flags.owndata
+    np.testing.assert_array_equal(cluster(others, 0.8), reference(others, 0.8))
+    np.testing.assert_array_equal(labels, expected)
+    in_warp = cluster(wp.array(points, dtype=wp.vec3, device="cpu"), 0.8)
+    np.testing.assert_array_equal(cluster(others, 0.8), reference(others, 0.8))
+    np.testing.assert_array_equal(in_warp.numpy(), expected)
+
+
 def test_a_cluster_of_min_size_stays_and_a_smaller_one_goes():
     points = np.array([[9, 0, 0], [0, 0, 0], [0.3, 0, 0], [5, 0, 0], [5.3, 0, 0], [5.6, 0, 0]], np.float32)
     assert cluster(points, 0.5, 1).tolist() == [0, 1, 1, 2, 2, 2]
