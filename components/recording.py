@@ -19,7 +19,7 @@ from ..datamesh.recording import RecordedEvent, Recorder
 from ..datamesh.recording_reader import Recording
 from ..errors import ConfigError, SourceError
 from .machine import describe_machine
-from .pipeline import Pipeline
+from .pipeline import LIDAR_TOPIC, Pipeline
 from .sources import open_source
 
 __all__ = ["PlaySummary", "RecordSummary", "play_recording", "record_source", "replay_lines", "replay_recording"]
@@ -380,7 +380,7 @@ def play_recording(
         if recorder is not None and record is not None:
             recorder.close()
             summary.recorded = RecordSummary(
-                record, commits=recorder.written, dropped=dict(recorder.dropped), failure=recorder.failure,
-                losses=mesh.losses.as_dict(),
+                record, player.published.get(LIDAR_TOPIC, 0), recorder.written, dict(recorder.dropped),
+                recorder.failure, mesh.losses.as_dict(),
             )  # fmt: skip
     return summary

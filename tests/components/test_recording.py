@@ -74,6 +74,7 @@ def test_under_loop_and_seek_too(street, tmp_path):
     )
     assert summary.published[LIDAR_TOPIC] == 10  # a camera is the first, 0.05 s before the sweep: 0.45 s on it
     assert summary.recorded.dropped == summary.recorded.losses == {}
+    assert (summary.recorded.frames, summary.recorded.failure) == (10, None)
     epochs = [(event.epoch, event.topic) for event in Recording(tmp_path / "looped.mcap")]
     assert [epochs.count((epoch, OBSTACLES_TOPIC)) for epoch in (0, 1)] == [5, 5]
     for workers, result, _ in replay_recording(tmp_path / "looped.mcap", workers=WORKERS):
