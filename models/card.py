@@ -101,6 +101,8 @@ class DecodeSpec(_Strict):
     """Of two boxes that overlap more than this from above, the better stays, whatever their classes."""
     overlap_weight: float = Field(0.0, ge=0, lt=1)
     """Share of the thought overlap in a score."""
+    refine: tuple[str, ...] = ()
+    """Classes whose boxes are turned and moved onto their points, see `kernels.box_refine`."""
     max_candidates: int = Field(ge=1)
     max_objects: int = Field(ge=1)
 
@@ -165,6 +167,8 @@ class HeadCard(LidarCard):
         wanted_out = (len(self.classes) + len(self.output.regression), rows // stride, columns // stride)
         if self.output.unfolded != wanted_out:
             return f"output.shape {self.output.shape} does not follow from classes, regression and stride: {wanted_out}"
+        if unknown := [name for name in self.decode.refine if name not in self.classes]:
+            return f"decode.refine names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
         if self.decode.overlap_weight and not self.output.overlap:
             return f"decode.overlap_weight is {self.decode.overlap_weight}, but output.regression has no {_OVERLAP}"
         return ""

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import ModelError
+from ..kernels.box_refine import BoxRefine
 from ..kernels.decode import CenterDecode
 from ..kernels.device import resolve_device
 from ..kernels.interop import borrow_points
@@ -55,6 +56,19 @@ class _Slot:
         )
         self.nms = RotatedNms(
             capacity=decode.max_candidates, threshold=decode.nms_iou, max_output=decode.max_objects, device=device
+        )
+        low, high = card.input.point_range[:2], card.input.point_range[3:5]
+        self.refine = (
+            BoxRefine(
+                capacity=capacity,
+                boxes=decode.max_objects,
+                refined=tuple(name in decode.refine for name in card.classes),
+                origin=low,
+                size=(high[0] - low[0], high[1] - low[1]),
+                device=device,
+            )
+            if decode.refine
+            else None
         )
 
 
@@ -205,6 +219,9 @@ class DetectionHead:
         for row, (slot, cloud) in enumerate(zip(self._slots, clouds, strict=False)):
             slot.decode.launch(self._maps[row : row + 1], self.score_threshold, cloud[2])
             slot.nms.launch(slot.decode.boxes, slot.decode.scores, slot.decode.count)
+            if slot.refine is not None:
+                found = (slot.decode.boxes, slot.decode.classes_found, slot.nms.keep, slot.nms.keep_count)
+                slot.refine.launch(cloud[0], cloud[1], *found)
 
     def _read(self, slot: _Slot) -> Detections:
         kept = int(slot.nms.keep_count.numpy()[0])

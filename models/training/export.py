@@ -100,6 +100,7 @@ def export_head(
             score_threshold=score_threshold,
             nms_iou=0.2,
             overlap_weight=overlap_weight,
+            refine=("vehicle",),
             max_candidates=2048,
             max_objects=256,
         ),

@@ -70,6 +70,7 @@ def test_a_missing_model_and_a_missing_card_are_named(card_path):
         ({"decode__nms_iou": 2.0}, "decode.nms_iou"),
         ({"decode__overlap_weight": 0.5}, "overlap_weight is 0.5, but output.regression has no iou"),
         ({"decode__overlap_weight": 1.0}, "decode.overlap_weight"),
+        ({"decode__refine": ["unicorn"]}, "decode.refine names unicorn, but the classes are vehicle"),
         ({"output__regression": ["dx", "dy"]}, "this version decodes dx, dy"),
         ({"surprise": 1}, "surprise"),
         ({"sha256": "abc"}, "sha256"),
