@@ -79,7 +79,7 @@ def reference(points, box):
     half = np.array([0.5 * length, 0.5 * width])
     above = points[:, 2] - z
     local = local[(np.abs(local) <= half + 0.25).all(1) & (above > 0.25 - 0.5 * height) & (above < 0.5 * height + 0.2)]
-    if len(local) < 15:
+    if len(local) < 30:
         return np.array(box)
     sensor = np.array([-x * c - y * s, x * s - y * c])
     near = np.where(sensor < 0, -1.0, 1.0)
@@ -143,7 +143,7 @@ def test_others_stay_as_they_are():
     assert changed[1, 6] != boxes[1, 6]
     np.testing.assert_array_equal(refine(points, boxes, [1, 1, 1]), boxes)
     np.testing.assert_array_equal(refine(points, boxes, [0, 0, 0], keep=[0, 2]), boxes)
-    np.testing.assert_array_equal(refine(points[:14], boxes, [0, 0, 0]), boxes)
+    np.testing.assert_array_equal(refine(points[:29], boxes, [0, 0, 0]), boxes)
     np.testing.assert_array_equal(refine(np.full((30, 3), np.nan), boxes, [0, 0, 0]), boxes)
 
 
