@@ -6,6 +6,7 @@ time does not depend on them), without making pillars or reading boxes. All run 
 
 import numpy as np
 import pytest
+import warp as wp
 
 from warploom.bench.contest import OURS, Contender, peer, record_figure
 from warploom.bench.scans import REAL
@@ -82,6 +83,22 @@ def bench_head(benchmark, contest, kernel, scan):
     record_figure(
         benchmark, f"{kernel}, {scan}, median", 1e3 * benchmark.stats.stats.median, "ms",
         goal=GOAL_MS if card == EIGHT_BITS_CARD else None, note=f"{len(points):,} points to boxes; {_THREADS} threads",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("scan", CLOUDS)
+def bench_refinement(benchmark, contest, scan):
+    """What it takes to turn and move the vehicles that were found onto their points, which the head's time includes."""
+    points = contest.cloud(scan)
+    head = DetectionHead(EIGHT_BITS_CARD, threads=_THREADS)
+    objects = head.detect_points(points, _HEIGHT)
+    slot = head._slots[0]
+    xyz = wp.array(np.ascontiguousarray(points[:, :3], np.float32), dtype=wp.vec3, device="cpu")
+    found = (slot.decode.boxes, slot.decode.classes_found, slot.nms.keep, slot.nms.keep_count)
+    benchmark.pedantic(lambda: slot.refine.launch(xyz, slot.count, *found), rounds=30, warmup_rounds=3)
+    record_figure(
+        benchmark, f"boxes refined, {scan}, median", 1e3 * benchmark.stats.stats.median, "ms",
+        note=f"{len(points):,} points, {len(objects)} objects; one thread",
     )  # fmt: skip
 
 

@@ -32,7 +32,11 @@ def main(
     learning_rate: Annotated[float, typer.Option(help="The highest of the cycle.")] = 3e-3,
     final_share: Annotated[float, typer.Option(help="What is left of it at the end.")] = 0.002,
     frozen: Annotated[
-        bool, typer.Option("--frozen", help="Batch norms keep the statistics of --start-from: steps take half as long.")
+        bool,
+        typer.Option(
+            "--frozen",
+            help="Batch norms keep the statistics of --start-from: the network's part of a step takes half as long.",
+        ),
     ] = False,
     fresh: Annotated[
         int | None, typer.Option(help="New windows in a batch of four; the others are known ones, turned.")

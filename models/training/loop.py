@@ -63,7 +63,7 @@ class TrainingConfig:
     kept: int = 4000
     """How many windows are kept to be learnt from again."""
     frozen: bool = False
-    """Batch norms keep the statistics they have, which halves the time of a step; for `start_from`."""
+    """Batch norms keep the statistics they have, so that the network takes half as long; for `start_from`."""
     window: float = 40.0
     """Half the edge of the square learnt from [m], a multiple of 8 cells."""
     cell: float = 0.25

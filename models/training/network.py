@@ -139,8 +139,8 @@ class PillarCenterNet(nn.Module):
 
         Args:
             pillars: Shape (n, C, H, W).
-            frozen: Batch norms keep their statistics and are folded into the convolutions, in the pillars' dtype:
-                half the time of a step. For networks that have been trained so far that those statistics hold.
+            frozen: Batch norms keep their statistics and are folded into the convolutions, in the dtype of pillars:
+                half the time. For networks that have been trained so far that those statistics hold.
         """
         features = self._frozen_features(pillars) if frozen else self._features(pillars)
         layers = [self.head] if self.extra is None else [self.head, self.extra]
