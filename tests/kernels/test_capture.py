@@ -15,6 +15,7 @@ import warploom as wl
 import warploom.kernels
 from warploom.kernels.anchor_decode import AnchorDecode
 from warploom.kernels.bev import BevMaps
+from warploom.kernels.box_refine import BoxRefine
 from warploom.kernels.boxes import FitBoxes
 from warploom.kernels.camera import camera_model
 from warploom.kernels.cluster import EuclideanCluster
@@ -203,6 +204,25 @@ def gathering(given):
     return plan, lambda: gather_rows(given.height, given.labels, given.count, plan.values)
 
 
+class Refined:
+    """Boxes that `BoxRefine` changes in place, copied from those of the frame."""
+
+    def __init__(self):
+        self.boxes = wp.zeros((BOXES, 7), dtype=wp.float32, device="cpu")
+
+
+def refinement(given):
+    refine, refined = BoxRefine(capacity=N, boxes=BOXES, refined=(True,)), Refined()
+    kinds = wp.zeros(BOXES, dtype=wp.int32, device="cpu")
+    keep = wp.array(np.arange(BOXES, dtype=np.int32), device="cpu")
+
+    def launch():
+        wp.copy(refined.boxes, given.boxes)
+        refine.launch(given.xyz, given.count, refined.boxes, kinds, keep, given.box_count)
+
+    return refined, launch
+
+
 def selection(given):
     plan = Selected()
     return plan, lambda: select_heights(given.include, given.height, given.count, (0.2, 3.0), plan.selected)
@@ -223,6 +243,7 @@ CASES = {
     "bev shared": simple(
         BevMaps, "xyz", "intensity", "count", capacity=N, point_range=RANGE, shape=(60, 50), method="shared"
     ),
+    "boxes refined": refinement,
     "boxes by shape": simple(FitBoxes, "xyz", "labels", "count", capacity=N, max_clusters=24),
     "boxes by area": simple(FitBoxes, "xyz", "labels", "count", capacity=N, max_clusters=64, method="min_area"),
     "cluster": simple(EuclideanCluster, "xyz", "count", "include", radius=0.5, min_size=2, capacity=N),
