@@ -10,8 +10,8 @@ from warploom.bench.transport_peers import WAYS, send_all
 SIZES = {"1 kB": 1_000, "2 MB": 2_000_000, "20 MB": 20_000_000}
 GOAL = 200.0  # [µs] of the median, whatever the size
 EVERY = 4e-3  # [s] from one to the next: the receiver sleeps, and what it needs leaves the processor's caches
-COUNT, COUNT_OF_LONG = 100, 30
-PACES = {"1 kHz": (1e-3, 200), "10 Hz": (0.1, 20)}  # [s] from one to the next, and how many
+COUNT = 100
+PACES = {"back to back": (0.0, 200), "1 kHz": (1e-3, 200), "10 Hz": (0.1, 20)}  # [s] from one to the next, and how many
 SLEEPING = "warploom, spin_us: 0"  # what staying awake takes and gives is measured at other paces
 PACED = ("warploom", SLEEPING, "zenoh", "iceoryx2", "POSIX shared memory")
 
@@ -24,14 +24,13 @@ def bench_transport(benchmark, monkeypatch, tmp_path, size, way):
     Midway between two data a bare message of 64 bytes goes to a process that does nothing else: what the machine takes
     in that minute to wake a process.
     """
-    count = COUNT_OF_LONG if SIZES[size] > 2_000_000 else COUNT
-    _measure(benchmark, monkeypatch, tmp_path, way, size, EVERY, count, size)
+    _measure(benchmark, monkeypatch, tmp_path, way, size, EVERY, COUNT, size)
 
 
 @pytest.mark.parametrize("way", PACED)
 @pytest.mark.parametrize("pace", PACES)
 def bench_transport_paces(benchmark, monkeypatch, tmp_path, pace, way):
-    """The same for 2 MB at other paces: a stream in which all stays in the caches, and the pace of a LiDAR."""
+    """The same for 2 MB at other paces: streams in which more stays in the caches, and the pace of a LiDAR."""
     every, count = PACES[pace]
     _measure(benchmark, monkeypatch, tmp_path, way, "2 MB", every, count, f"2 MB, {pace}")
 

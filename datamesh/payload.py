@@ -113,6 +113,9 @@ def freeze(value: Any) -> None:
     further objects among those: such a class has a method `freeze`. Arrays of Warp and torch cannot be protected: a
     mesh with `check=True` compares their checksums.
     """
+    if type(value) is np.ndarray:  # the usual case, without a call
+        value.setflags(write=False)
+        return
     kind = _kind(type(value))
     if kind == "leaf" or kind == "device array":
         return

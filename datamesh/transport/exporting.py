@@ -101,7 +101,7 @@ class Exporter:
         self._built = self._copied = Usage()
         self._begun_ns = self._told_ns = 0
         self._durations = Durations()
-        self._soon = pack_soon(0, 0)
+        self._due_ns = (0, 0)
         self._newest = self._newest_of(window)
         self._form: Any = None
         self._body = b""
@@ -155,17 +155,19 @@ class Exporter:
     def _arena(self) -> SlabArena:
         self._begun_ns = now = time.perf_counter_ns()
         if self._config.announce and now - self._told_ns > _COLD_NS:
-            self._announce()
+            self._announce(now)
         arena = SlabArena(self._lease, self._built.size, partial(self._count, "no_memory"))
         self._built = arena.used
         return arena
 
-    def _announce(self) -> None:
+    def _announce(self, begun_ns: int) -> None:
         """Wakes the readers while the payload is built, for them to be ready when it comes."""
+        soon, late = self._due_ns
+        message = pack_soon(begun_ns + soon, begun_ns + late)
         for reader in tuple(self._readers):
             if reader.kept is None and not reader.is_full:
                 with suppress(OSError):  # it is gone, or has enough to read
-                    reader.send(self._soon)
+                    reader.send(message)
 
     def _lease(self, size: int) -> Lease | None:
         with self._lock:
@@ -221,7 +223,7 @@ class Exporter:
         self._counts["commits"] += 1
         self._told_ns = now = time.perf_counter_ns()
         if self._begun_ns:
-            self._soon = pack_soon(*self._durations.add(now - self._begun_ns))
+            self._due_ns = self._durations.add(now - self._begun_ns)
             self._begun_ns = 0
 
     def _tell_array(self, entry: Entry, epoch: int, slab: Slab, offset: int) -> None:

@@ -54,12 +54,14 @@ _SOON = bytes((SOON,))
 _AT_ONCE = int(socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
 _DONT_WAIT = int(socket.MSG_DONTWAIT)
-_SHORT_NS = 200_000
+_SHORT_NS = 100_000
 """A datum that comes so soon is there before its reader has gone through the last one [ns]."""
 _LEAD_NS = 600_000
 """How long before a datum is due to wake by a timer, which takes its time, and to go through the last one [ns]."""
 _NAP_NS = 300_000
 """What is shorter is not slept [ns]."""
+_WARM_NS = 50_000
+"""For how long what was gone through stays in the caches, while the writer fills them with its payload [ns]."""
 _SELECTABLE = 1024
 """Descriptors from here on cannot be waited for with a time of less than a millisecond."""
 
@@ -360,7 +362,8 @@ def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> 
     """Receives what was announced just now, and is ready for it when it comes.
 
     After a pause, what it takes is no longer in the processor's caches, and a core that sleeps takes long to wake: so
-    it sleeps until shortly before the datum is due, goes through the last one once more, and stays awake from there.
+    it sleeps until shortly before the datum is due, goes through the last one once more, and stays awake from there,
+    going through it again now and then.
 
     Args:
         connection: Where it comes.
@@ -372,23 +375,30 @@ def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> 
         The message, and for how long it stayed awake, and whether in vain, as `Expectation.came` takes it.
     """
     now = time.perf_counter_ns
-    announced, one = now(), connection.socket
+    one = connection.socket
     receive = one.recv
     soon, late = read_soon(word)
-    if soon < _SHORT_NS:  # it is as good as there
+    left = soon - now()
+    if left < _SHORT_NS:  # it is as good as there
         return receive(MESSAGE), (0, False)
-    nap = soon - _LEAD_NS
+    nap = left - _LEAD_NS
     if nap > _NAP_NS and allowed > 0 and one.fileno() < _SELECTABLE:
         select.select((one,), (), (), nap / 1e9)
     if last:
         _rehearse(connection, last)
     here = awake = now()
-    until = min(announced + late, here + allowed)
+    until = min(late, here + allowed)
+    again = here + _WARM_NS
     while here < until:
         try:
             data = receive(MESSAGE, _DONT_WAIT)
         except BlockingIOError:
-            here = now()
+            if (here := now()) > again and last:
+                _rehearse(connection, last)
+                here, begun = now(), here
+                again = here + max(
+                    _WARM_NS, 2 * (here - begun)
+                )  # a datum may come meanwhile: at most a third is spent so
             continue
         return data, (here - awake, False)
     return receive(MESSAGE), (here - awake, here > awake)

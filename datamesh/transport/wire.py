@@ -107,13 +107,13 @@ def pack_commit(
     return _pack_commit(COMMIT, flags, 1, 0, number, epoch, version, received_ns, committed_ns, offset, size)
 
 
-def pack_soon(soon_ns: int, late_ns: int) -> bytearray:
-    """The word that a commit is about to come, and between which times from now it is expected [ns]."""
-    return pack_event(Event(SOON, 0, 0, 0, soon_ns, late_ns))
+def pack_soon(soon_ns: int, late_ns: int) -> bytes:
+    """The word that a commit is about to come, and between which times of `time.perf_counter_ns` it is expected."""
+    return _pack_head(SOON, 0, 0, 0, 0, 0, 0, soon_ns, late_ns)
 
 
 def read_soon(data: bytes) -> tuple[int, int]:
-    """Between which times from now a commit is expected [ns].
+    """Between which times of `time.perf_counter_ns`, the same in all processes of a host, a commit is expected.
 
     Raises:
         ValueError: It is truncated.

@@ -287,7 +287,7 @@ def commit_of(number, body, slabs=(), body_size=0):
 )
 def test_a_reader_that_stays_awake_gets_all_and_ends(linked, monkeypatch, spin_us, share, build_s):
     monkeypatch.setattr(exporting, "_COLD_NS", -1)  # each payload that is begun is announced
-    monkeypatch.setattr(importing, "_SHORT_NS", -1)
+    monkeypatch.setattr(importing, "_SHORT_NS", -(1 << 62))  # and is waited for
     writer, reader = linked(spin_us=spin_us, spin_share=share)
 
     def build(change):
@@ -308,7 +308,10 @@ def test_a_reader_that_stays_awake_gets_all_and_ends(linked, monkeypatch, spin_u
     assert not thread.is_alive()
 
 
-SOON_MESSAGE = pack_soon(1_000_000, 2_000_000)
+def soon_message():
+    """That a commit is expected in 1 to 2 ms."""
+    now = time.perf_counter_ns()
+    return pack_soon(now + 1_000_000, now + 2_000_000)
 
 
 class TestRehearsals:
@@ -317,7 +320,7 @@ class TestRehearsals:
     def test_they_change_and_hold_nothing(self, linked, monkeypatch):
         values = []
         monkeypatch.setattr(exporting, "_COLD_NS", -1)  # each payload that is begun is announced
-        monkeypatch.setattr(importing, "_SHORT_NS", -1)
+        monkeypatch.setattr(importing, "_SHORT_NS", -(1 << 62))  # and is waited for
         monkeypatch.setattr(importing, "_rehearse", lambda *_, of=importing._rehearse: values.append(of(*_)))
         writer, reader = linked(capacity=2)
         for version in range(1, 6):
@@ -338,7 +341,7 @@ class TestRehearsals:
 
         rehearsed, others = [], memories()
         monkeypatch.setattr(exporting, "_COLD_NS", -1)
-        monkeypatch.setattr(importing, "_SHORT_NS", -1)
+        monkeypatch.setattr(importing, "_SHORT_NS", -(1 << 62))  # and is waited for
         monkeypatch.setattr(importing, "_rehearse", lambda *_, of=importing._rehearse: rehearsed.append(of(*_)))
         reader = side("reader", imports=["topic"], capacity=1)
         gc.disable()  # as between two of its full passes, which may be minutes
@@ -362,7 +365,7 @@ class TestRehearsals:
         """What the last one refers to may hold something else by now."""
         reader = side("reader", imports=["topic"])
         one = impostor.accept()
-        for data in (SOON_MESSAGE, commit_of(1, TestDamage.BEYOND, ((0, 4096),)), SOON_MESSAGE, SOON_MESSAGE):
+        for data in (soon_message(), commit_of(1, TestDamage.BEYOND, ((0, 4096),)), soon_message(), soon_message()):
             one.send(data)
         one.send(commit_of(2, encode("whole")))
         reader.until(lambda counts: counts.get("received") == 1, "topic")
