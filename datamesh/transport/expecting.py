@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 
-__all__ = ["Durations", "Expectation"]
+__all__ = ["Durations", "Expectation", "current_core", "leave_core"]
 
 _REMEMBERED = 8
 _SAVED_NS = 5_000_000
@@ -14,6 +16,20 @@ _SAVED_NS = 5_000_000
 _LONGEST_PAUSE = 256
 _LATE_NS = 200_000
 """How much longer than all before it a payload may take, to be waited for all the same [ns]."""
+
+current_core: Callable[[], int] = ctypes.PyDLL(None).sched_getcpu  # which keeps the interpreter's lock: it is short
+"""On which core the calling thread runs."""
+
+
+def leave_core(core: int) -> None:
+    """Moves the calling thread to another core, if it is on this one and may run elsewhere.
+
+    Linux likes to wake a thread on the core of who wakes it by a socket, as if that were about to sleep. Who stays
+    awake there takes the core from the one it waits for.
+    """
+    if current_core() == core and len(cores := os.sched_getaffinity(0)) > 1:
+        os.sched_setaffinity(0, cores - {core})
+        os.sched_setaffinity(0, cores)
 
 
 class Durations:

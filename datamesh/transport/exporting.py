@@ -26,7 +26,7 @@ from ..messages import encode
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
-from .expecting import Durations
+from .expecting import Durations, current_core
 from .keeping import Absent
 from .places import OrderFile, keep_from_children, listen, peer_of, unlisten
 from .placing import NoRoom, Placing
@@ -163,7 +163,7 @@ class Exporter:
     def _announce(self, begun_ns: int) -> None:
         """Wakes the readers while the payload is built, for them to be ready when it comes."""
         soon, late = self._due_ns
-        message = pack_soon(begun_ns + soon, begun_ns + late)
+        message = pack_soon(current_core(), begun_ns + soon, begun_ns + late)
         for reader in tuple(self._readers):
             if reader.kept is None and not reader.is_full:
                 with suppress(OSError):  # it is gone, or has enough to read

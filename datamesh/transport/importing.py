@@ -25,7 +25,7 @@ from ..policy import CommitPolicy, EqualVersion
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
-from .expecting import Expectation
+from .expecting import Expectation, leave_core
 from .places import connect, peer_of
 from .slabs import Region
 from .wire import (
@@ -377,7 +377,9 @@ def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> 
     now = time.perf_counter_ns
     one = connection.socket
     receive = one.recv
-    soon, late = read_soon(word)
+    core, soon, late = read_soon(word)
+    if allowed > 0:
+        leave_core(core)
     left = soon - now()
     if left < _SHORT_NS:  # it is as good as there
         return receive(MESSAGE), (0, False)

@@ -107,20 +107,26 @@ def pack_commit(
     return _pack_commit(COMMIT, flags, 1, 0, number, epoch, version, received_ns, committed_ns, offset, size)
 
 
-def pack_soon(soon_ns: int, late_ns: int) -> bytes:
-    """The word that a commit is about to come, and between which times of `time.perf_counter_ns` it is expected."""
-    return _pack_head(SOON, 0, 0, 0, 0, 0, 0, soon_ns, late_ns)
+def pack_soon(core: int, soon_ns: int, late_ns: int) -> bytes:
+    """The word that a commit is about to come.
+
+    Args:
+        core: On which it is built.
+        soon_ns: From which time of `time.perf_counter_ns` on it is expected, which all processes of a host share.
+        late_ns: Until when.
+    """
+    return _pack_head(SOON, 0, 0, 0, 0, 0, core, soon_ns, late_ns)
 
 
-def read_soon(data: bytes) -> tuple[int, int]:
-    """Between which times of `time.perf_counter_ns`, the same in all processes of a host, a commit is expected.
+def read_soon(data: bytes) -> tuple[int, int, int]:
+    """On which core a commit is built, and between which times it is expected.
 
     Raises:
         ValueError: It is truncated.
     """
     if len(data) < _HEAD_SIZE:
         raise ValueError(f"truncated: a message of {len(data)} bytes, where a head has {_HEAD_SIZE}")
-    return _unpack_head(data)[-2:]
+    return _unpack_head(data)[-3:]
 
 
 def set_number(data: bytearray, number: int) -> None:

@@ -1,13 +1,14 @@
 """For how long a reader stays awake: bounded for each datum, bounded of all time, and not where it does not help."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
 from warploom.datamesh.transport import expecting
-from warploom.datamesh.transport.expecting import Durations, Expectation
+from warploom.datamesh.transport.expecting import Durations, Expectation, current_core, leave_core
 
 MOST = 1_000_000
 
@@ -103,3 +104,40 @@ def test_there_are_those_who_always_sleep(monkeypatch, passes, most, share, core
         passes(10**9)
         expectation.came(0, False)
         assert expectation.allowed == 0
+
+
+def in_a_thread(work):
+    """What `work` gives, in a thread of its own, whose affinity is its own too."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(work).result()
+
+
+def test_who_is_on_the_core_of_the_writer_leaves_it():
+    def leave():
+        allowed = os.sched_getaffinity(0)
+        here = current_core()
+        os.sched_setaffinity(0, {here})
+        os.sched_setaffinity(0, allowed)
+        leave_core(here)
+        return allowed, os.sched_getaffinity(0), here, current_core()
+
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("this process has one core")
+    tries = [in_a_thread(leave) for _ in range(20)]
+    assert all(before == after for before, after, _, _ in tries), "it may run everywhere again"
+    assert any(here != there for _, _, here, there in tries), "unless it is moved back at once"
+
+
+def test_who_is_elsewhere_or_has_one_core_stays(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("moved")
+
+    def stay():
+        cores = os.sched_getaffinity(0)
+        here = min(cores)
+        os.sched_setaffinity(0, {here})
+        monkeypatch.setattr(os, "sched_setaffinity", refuse)
+        leave_core(here)
+        leave_core(here + 1)
+
+    in_a_thread(stay)

@@ -311,7 +311,7 @@ def test_a_reader_that_stays_awake_gets_all_and_ends(linked, monkeypatch, spin_u
 def soon_message():
     """That a commit is expected in 1 to 2 ms."""
     now = time.perf_counter_ns()
-    return pack_soon(now + 1_000_000, now + 2_000_000)
+    return pack_soon(0, now + 1_000_000, now + 2_000_000)
 
 
 class TestRehearsals:

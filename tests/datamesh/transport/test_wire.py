@@ -48,13 +48,13 @@ def test_an_event_is_read_as_it_was_sent(event):
     assert read._replace(body=bytes(read.body)) == event
 
 
-@given(TIME, TIME)
-def test_an_announcement_says_when_to_expect_what_it_announces(soon, late):
-    assert read_soon(pack_soon(soon, late)) == (soon, late)
-    assert read_event(pack_soon(soon, late), MEMORY).kind == SOON
+@given(st.integers(0, 4095), TIME, TIME)
+def test_an_announcement_says_where_it_is_built_and_when_to_expect_it(core, soon, late):
+    assert read_soon(pack_soon(core, soon, late)) == (core, soon, late)
+    assert read_event(pack_soon(core, soon, late), MEMORY).kind == SOON
 
 
-@given(st.binary(max_size=len(pack_soon(0, 0)) - 1))
+@given(st.binary(max_size=len(pack_soon(0, 0, 0)) - 1))
 def test_a_short_one_is_refused(data):
     with pytest.raises(ValueError, match="truncated"):
         read_soon(data)
