@@ -9,7 +9,7 @@ import pkgutil
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -71,6 +71,9 @@ def _unique_keys(node: yaml.Node | None, path: Path, visited: set[int]) -> None:
 
 class ConfigFile(Generic[M]):
     """One configuration file: its model, and for messages the lines on which its keys stand."""
+
+    part_name: ClassVar[str] = "key"
+    """What a part of such a file is called in messages."""
 
     def __init__(
         self,
@@ -141,6 +144,10 @@ class ConfigFile(Generic[M]):
                 return line
         return line
 
+    def place(self, keys: Sequence[str | int]) -> str:
+        """How a message calls a place in the file."""
+        return ".".join(map(str, keys)) or "file"
+
     def _told(self, message: str) -> ConfigError:
         """An error whose message begins with the keys that it is about."""
         keys, _, what = message.partition(": ")
@@ -148,7 +155,7 @@ class ConfigFile(Generic[M]):
 
     def error(self, keys: Sequence[str | int], message: str) -> ConfigError:
         """An error about a key of this file."""
-        return ConfigError(f"{self.path}:{self.line(keys)}: {'.'.join(map(str, keys))}: {message}")
+        return ConfigError(f"{self.path}:{self.line(keys)}: {self.place(keys)}: {message}")
 
     def validate(self, keys: Sequence[str | int], model: type[BaseModel], data: Mapping[str, Any]) -> BaseModel:
         """Validates a part of this file, at `keys`, by a model of its own.
@@ -165,16 +172,20 @@ class ConfigFile(Generic[M]):
         lines = []
         for problem in error.errors():
             keys = [*prefix, *(key for key in problem["loc"] if key != "[key]")]
-            where = f"{self.path}:{self.line(keys)}: {'.'.join(map(str, keys)) or 'file'}"
+            where = f"{self.path}:{self.line(keys)}: {self.place(keys)}"
             if any(tuple(keys[: len(change)]) == change for change in self._changes):
                 where += " (as set from outside the file)"
             if problem["type"] == "extra_forbidden":
                 owner = _model_at(model, problem["loc"][:-1])
                 known = list(_fields(owner))
                 hint = hint_for_key(str(keys[-1]), problem["input"], known, owner)
-                lines.append(f"{where}: unknown key; " + (f"{hint}; " if hint else "") + nearest(str(keys[-1]), known))
+                lines.append(
+                    f"{where}: unknown {self.part_name}; "
+                    + (f"{hint}; " if hint else "")
+                    + nearest(str(keys[-1]), known)
+                )
             elif problem["type"] == "missing":
-                lines.append(f"{where}: this key is missing")
+                lines.append(f"{where}: this {self.part_name} is missing")
             else:
                 expected = problem["msg"].removeprefix("Value error, ")
                 found = problem["input"]

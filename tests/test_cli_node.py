@@ -163,7 +163,7 @@ def test_what_is_missing_is_named_with_the_way_out_and_nothing_starts(folder, wa
         (["launch", "twoo"], "no launch file 'twoo': neither a file nor a name; did you mean 'two'"),
         (["launch", "none.launch.yaml"], "no launch file 'none.launch.yaml'"),
         (["launch", "--hw", "made-up"], "no launch file is for --hw made-up; there are: --hw hw1 --lidar test9"),
-        (["launch", "-c", "tiker.yaml", "-p", "p"], "-c tiker.yaml: no module 'tiker.yaml'"),
+        (["launch", "-c", "tiker.yaml", "-p", "p"], "-c tiker.yaml: no module file 'tiker.yaml'"),
         (["launch", "-c", "doubler.yaml", "-p", "p"], "nobody produces topic 'ticks'"),
         (["launch", "-c", "ticker.yaml", "-p", "a/b"], "a name is 1 to 64 letters"),
         (["launch", "two", "--profile", "cpuu"], "no profile 'cpuu'"),

@@ -82,7 +82,7 @@ def plan_modules(
             except ConfigError as error:
                 raise file.error(keys, str(error)) from None
             if path.resolve() in [one.path.resolve() for one in files]:
-                raise file.error(keys, f"the module {name!r} stands twice in process {process.name!r}")
+                raise file.error(keys, f"the module file {name!r} stands twice in process {process.name!r}")
             files.append(load_module(path, merged, sensors))
         modules[process.name] = tuple(files)
     known = {component.name for files in modules.values() for one in files for component in one.content.components}
@@ -107,4 +107,4 @@ def _module_path(beside: Path, name: str, shipped: Path) -> Path:
     except ConfigError:
         folders = [folder / "modules" for folder in config_folders(shipped)]
         known = {str(one.relative_to(folder)) for folder in folders for one in folder.rglob("*.yaml")}
-        raise ConfigError(f"no module {name!r}: neither a file nor a name; {nearest(name, known)}") from None
+        raise ConfigError(f"no module file {name!r}: neither a path nor a name; {nearest(name, known)}") from None

@@ -36,6 +36,8 @@ _BYTES = 1_000_000
 _NESTED = {"hardware": HardwareSpec, "back_off": BackOffSpec, "restarts": RestartsSpec, "limits": LimitsSpec}
 _OF_NODE = tuple(name for name in LaunchSpec.model_fields if name in ("node", "description", "hardware", "profile"))
 _OF_PROCESS = tuple("dag_conf" if name == "modules" else name for name in ProcessSpec.model_fields)
+_ELEMENTS = {"processes": "module", "modules": "dag_conf"}
+"""Keys in YAML that elements do not have the names of."""
 
 Place = tuple[str | int, ...]
 
@@ -49,7 +51,9 @@ class _Element:
 
 
 class XmlLaunchFile(ConfigFile[LaunchSpec]):
-    """A launch file in XML: the same content and the same messages as one in YAML."""
+    """A launch file in XML: the same content as one in YAML; messages call its parts as they stand in it."""
+
+    part_name = "element"
 
     def __init__(self, path: str | Path, changes: Mapping[Place, Any] | None = None) -> None:
         """Reads and validates a file.
@@ -79,6 +83,16 @@ class XmlLaunchFile(ConfigFile[LaunchSpec]):
             if tuple(keys[:length]) in self._lines:
                 return self._lines[tuple(keys[:length])]
         return 1
+
+    def place(self, keys: Sequence[str | int]) -> str:
+        """A path of elements as XPath writes it, numbers from 1: `module[2]/dag_conf[1]`."""
+        steps: list[str] = []
+        for key in keys:
+            if isinstance(key, int) and steps:
+                steps[-1] += f"[{key + 1}]"
+            else:
+                steps.append(_ELEMENTS.get(str(key), str(key)))
+        return "/".join(steps) or "cybertron"
 
     def _refuse(self, line: int, message: str) -> ConfigError:
         return ConfigError(f"{self.path}:{line}: {message}")
@@ -140,7 +154,7 @@ class XmlLaunchFile(ConfigFile[LaunchSpec]):
                 rest.append(child)
         node = self._mapping(rest, (), (*_OF_NODE, "module"))
         node.setdefault("node", self.path.name.split(".")[0])
-        return {**node, "processes": processes}
+        return {**node, **({"processes": processes} if processes else {})}
 
     def _process(self, module: _Element, place: Place) -> dict[str, Any]:
         self._lines[place] = module.line
@@ -154,7 +168,7 @@ class XmlLaunchFile(ConfigFile[LaunchSpec]):
         process = self._mapping(rest, place, _OF_PROCESS)
         if isinstance(process.get("cpus"), str):
             process["cpus"] = [cpu.strip() for cpu in process["cpus"].split(",") if cpu.strip()]
-        return {**process, "modules": [file.text for file in files]}
+        return {**process, **({"modules": [file.text for file in files]} if files else {})}
 
     def _mapping(self, elements: Sequence[_Element], place: Place, known: Sequence[str]) -> dict[str, Any]:
         """Elements as keys and values; each once, all known; `known` empty takes any."""

@@ -182,6 +182,12 @@ def test_what_is_not_ready_in_time_is_ended(watched, behaviour):
     assert "was not ready for 0.3 s; was ended by SIG" in one.process.last_death
 
 
+def test_what_does_not_come_to_run_in_time_is_ended_too(watched):
+    one = watched(nothing, "never starts", exception_handler="ignore", start_timeout_s=0.5)
+    assert "did not start its components within 0.5 s; was ended by SIG" in one.process.last_death
+    assert "ready" in one.states()
+
+
 def test_what_does_not_stop_is_killed(watched):
     one = watched(run_and_stop, "does not stop", stop_timeout_s=0.2)
     assert one.states()[-1] == "stopped"

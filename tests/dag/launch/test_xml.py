@@ -2,6 +2,8 @@
 
 import pytest
 
+from warploom.dag.launch.lookup import load_launch_file
+from warploom.dag.launch.plan import plan_modules
 from warploom.dag.launch.xml import XmlLaunchFile
 from warploom.errors import ConfigError
 
@@ -31,6 +33,9 @@ GOOD = """\
 """
 
 
+EMPTY_MODULE = "module: avar_reporter\ncomponents: []\n"
+
+
 def load(tmp_path, text, changes=None):
     path = tmp_path / "computing_node_hw50.launch.xml"
     path.write_text(text, encoding="utf-8")
@@ -57,12 +62,12 @@ def test_settings_from_outside_go_before_the_file(tmp_path):
     ("old", "new", "expected"),
     [
         ("<nice>-5</nice>", "<nise>5</nise>", r":15: unknown element <nise>; did you mean 'nice'"),
-        ("<nice>-5</nice>", "<nice>high</nice>", r":15: processes.1.nice: .*integer.*found 'high'"),
+        ("<nice>-5</nice>", "<nice>high</nice>", r":15: module\[2\]/nice: .*integer.*found 'high'"),
         ("<nice>-5</nice>", "<nice>1</nice><nice>2</nice>", r":15: <nice> stands twice; the first is on line 15"),
         ("<nice>-5</nice>", "<nice><b>1</b></nice>", r":15: <nice> holds <b>; expected a text"),
-        ("<type>energon</type>", "<type>binary</type>", r":5: processes.0.type: .*found 'binary'"),
+        ("<type>energon</type>", "<type>binary</type>", r":5: module\[1\]/type: .*found 'binary'"),
         ("<type>energon</type>", "<type kind='a'>energon</type>", r":5: <type> has the attribute 'kind'"),
-        ("<dag_conf>planning.yaml</dag_conf>", "", r":12: processes.1.modules: "),
+        ("<dag_conf>planning.yaml</dag_conf>", "", r":12: module\[2\]/dag_conf: this element is missing"),
         ("<dag_conf>planning.yaml</dag_conf>", "<dag_conf/>", r":20: <dag_conf>: expected the name of a module file"),
         ("<limit>7</limit>", "<limits>7</limits>", r":18: unknown element <limits>; did you mean 'limit'"),
         ("<hw>hw50</hw>", "<hw>hw50", r":2: is not XML: mismatched tag"),
@@ -74,6 +79,19 @@ def test_each_mistake_names_file_line_and_what_was_expected(tmp_path, old, new, 
     assert old in GOOD
     with pytest.raises(ConfigError, match=r"computing_node_hw50\.launch\.xml" + expected):
         load(tmp_path, GOOD.replace(old, new))
+
+
+def test_mistakes_that_are_found_later_are_told_in_words_of_the_file_too(tmp_path):
+    with pytest.raises(ConfigError, match=r"launch\.xml:1: module: this element is missing"):
+        load(tmp_path, "<cybertron><node>empty</node></cybertron>")
+    path = tmp_path / "twice.launch.xml"
+    path.write_text(GOOD.replace("planning_sched", "compute3d_sched"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"launch\.xml:13: module\[2\]/name: there is a process 'compute3d_sched'"):
+        load_launch_file(path)
+    (tmp_path / "avar_reporter.yaml").write_text(EMPTY_MODULE)
+    file = load(tmp_path, GOOD.replace("blindspot", "blidnspot"))
+    with pytest.raises(ConfigError, match=r"launch\.xml:10: module\[1\]/dag_conf\[2\]: no module file 'perception/b"):
+        plan_modules(file, tmp_path / "conf")
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,8 @@ for order in orders():
     if order["do"] == "start":
         if behaviour in ("dies at once", "talks"):
             os.kill(os.getpid(), signal.SIGSEGV if behaviour == "talks" else signal.SIGKILL)
+        if behaviour == "never starts":
+            time.sleep(60)
         if behaviour == "breaks":
             say("broke", error="RuntimeError: no sensor")
             sys.exit(1)
