@@ -1,8 +1,8 @@
 """How far each point's nearest neighbours are, on average; on a tree of boxes.
 
 The points of a leaf look for their neighbours together. Each keeps a list of squared distances, cut to the least when
-it is full. Distances are summed in a fixed order, so that the same cloud gives the same answer each time, whatever the
-threads do.
+it is full. `neighbor_parts.py` does the same for a CPU, where the leaf has one list. The same cloud gives the same
+answer each time, whatever the threads do.
 """
 
 from __future__ import annotations
@@ -13,56 +13,20 @@ from typing import Any
 import warp as wp
 
 from .device import DEFAULT_DEVICE
+from .leaf_lanes import Eight, lay_out, lay_out_boxes, parts_for
+from .neighbor_parts import mean_distances_in_parts, rows_for
 from .point_tree import LEAF, PointTree, next_node
 from .threads import launch_parts, thread_count
 
-__all__ = ["Eight", "NeighborDistances", "lay_out", "parts_for"]
+__all__ = ["NeighborDistances"]
 
 # How far a point is must not hang on whether a compiler fuses a multiplication with an addition.
 wp.set_module_options({"fuse_fp": False})
 
-_RUN = wp.constant(32)  # leaves that one part looks at before it leaves as many to the others
-_SLOTS = wp.constant(32)  # numbers from one part to the next, in different lines of the cache
 _MOST_NEIGHBORS = 1024
-_LEAST_OF_PART = 512  # points for which a thread of their own is worth its while
 _WINDOW = wp.constant(3)  # leaves on either side of one that tell how far neighbours may be
 _LARGEST = wp.constant(3.0e38)
 _FARTHEST = wp.constant(wp.float64(3.0e38))
-
-Eight = wp.types.vector(length=int(LEAF), dtype=wp.float32)
-"""One coordinate of the points of a leaf."""
-
-
-def parts_for(points: int, most: int) -> int:
-    """In how many parts a CPU looks at points: few are not worth a second thread."""
-    return max(1, min(most, points // _LEAST_OF_PART))
-
-
-@wp.kernel
-def lay_out(
-    # in
-    points_in: wp.array(dtype=wp.vec3),
-    size_in: wp.array(dtype=wp.int32),
-    # out
-    x_out: wp.array(dtype=Eight),
-    y_out: wp.array(dtype=Eight),
-    z_out: wp.array(dtype=Eight),
-):
-    """Coordinates of a leaf side by side, for vector instructions; where it has no point, infinitely far."""
-    leaf = wp.tid()
-    x = Eight(wp.inf)
-    y = Eight(wp.inf)
-    z = Eight(wp.inf)
-    for k in range(LEAF):
-        i = leaf * LEAF + k
-        if i < size_in[0]:
-            p = points_in[i]
-            x[k] = p[0]
-            y[k] = p[1]
-            z[k] = p[2]
-    x_out[leaf] = x
-    y_out[leaf] = y
-    z_out[leaf] = z
 
 
 @wp.struct
@@ -70,11 +34,9 @@ class _Lists:
     """Where the lists of the points of a leaf lie."""
 
     room: int  # numbers that each list can hold
-    pitch: int  # from the list of a point to that of the next
-    step: int  # from a number to the next
+    step: int  # from a number to the next; those of other points lie between
 
 
-# The next two in C++, where a compiler makes vector instructions of the loops: twice as fast as the same in Python.
 @wp.func_native("""
     float square[8];
     for (int k = 0; k < 8; ++k) {
@@ -132,7 +94,7 @@ def _append(
             square[m] = INFINITY;
         int count = filled.data[slot + m];
         const float most = reach[m];
-        float* to = nearest.data + first + m * pitch + count * step;
+        float* to = nearest.data + first + m + count * step;
         for (int k = 0; k < 8; ++k) {
             const int stays = square[k] < most;
             *to = square[k];
@@ -157,7 +119,6 @@ def _visit(
     z: Eight,
     nearest: wp.array(dtype=wp.float32),
     first: int,
-    pitch: int,
     step: int,
     slot: int,
     within: wp.array(dtype=wp.float32),
@@ -184,10 +145,7 @@ def _gap_squared_between(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_
     float* const values = nearest.data + first;
     const auto below = [&](const float limit) {
         int found = 0;
-        if (step == 1)
-            for (int k = 0; k < count; ++k) found += values[k] < limit;
-        else
-            for (int k = 0; k < count; ++k) found += values[k * step] < limit;
+        for (int k = 0; k < count; ++k) found += values[k * step] < limit;
         return found;
     };
     const auto bits_of = [](const float value) { union { float f; int i; } both; both.f = value; return both.i; };
@@ -225,17 +183,11 @@ def _gap_squared_between(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_
         spare = wanted - below(limit);
     }
     int kept = 0;
-    const auto keep = [&](const int stride) {
-        for (int k = 0; k < count; ++k) {
-            const float value = values[k * stride];
-            values[kept * stride] = value;
-            kept += value < limit;
-        }
-    };
-    if (step == 1)
-        keep(1);
-    else
-        keep(step);
+    for (int k = 0; k < count; ++k) {
+        const float value = values[k * step];
+        values[kept * step] = value;
+        kept += value < limit;
+    }
     for (; spare > 0; --spare)
         values[kept++ * step] = limit;
     filled.data[slot] = kept;
@@ -255,94 +207,6 @@ def _keep_least(
 
     Gives a number that none that is left exceeds, and at which there is no need for another.
     """
-
-
-@wp.func
-def _mean_distances_of(
-    leaf: int,
-    size: int,
-    points: wp.array(dtype=wp.vec3),
-    x: wp.array(dtype=Eight),
-    y: wp.array(dtype=Eight),
-    z: wp.array(dtype=Eight),
-    low: wp.array(dtype=wp.vec3),
-    high: wp.array(dtype=wp.vec3),
-    leaves: int,
-    neighbors: int,
-    lists: _Lists,
-    first: int,
-    slot: int,
-    nearest: wp.array(dtype=wp.float32),
-    filled: wp.array(dtype=wp.int32),
-    within: wp.array(dtype=wp.float32),
-    mean: wp.array(dtype=wp.float32),
-):
-    """The mean distances of a leaf's points to their nearest neighbours: all together, from the leaf on upwards."""
-    begin = leaf * LEAF
-    members = wp.min(LEAF, size - begin)
-    wanted = wp.min(neighbors, size - 1)
-    own_low = low[leaves + leaf]
-    own_high = high[leaves + leaf]
-    # How far the neighbours of the leaf's centre are, at most: by the points next in the order.
-    centre = 0.5 * own_low + 0.5 * own_high
-    found = int(0)
-    for other in range(wp.max(leaf - _WINDOW, 0), wp.min(leaf + _WINDOW, leaves - 1) + 1):
-        found = _append(centre, x[other], y[other], z[other], _LARGEST, nearest, first, lists.step, found)
-    reach = float(wp.inf)
-    if found > wanted:
-        reach = wp.sqrt(_keep_least(nearest, first, lists.step, found, wanted + 1, wanted + 1, filled, slot))
-    limit = float(0.0)
-    for member in range(members):
-        filled[slot + member] = 0
-        way = reach + wp.length(points[begin + member] - centre)
-        within[slot + member] = way * way * 1.00001 + 1.0e-37
-        limit = wp.max(limit, within[slot + member])
-    node = leaves + leaf
-    root = int(node)
-    while node > 0 and wanted > 0:
-        at = int(root)
-        while at > 0:
-            low_at = low[at]
-            high_at = high[at]
-            if _gap_squared_between(own_low, own_high, low_at, high_at) >= limit:
-                at = next_node(at, root)
-            elif at < leaves:
-                at = 2 * at
-            else:
-                other = at - leaves
-                longest = _visit(
-                    members, x[leaf], y[leaf], z[leaf], other == leaf, low_at, high_at, x[other], y[other], z[other],
-                    nearest, first, lists.pitch, lists.step, slot, within, filled,
-                )  # fmt: skip
-                if longest > lists.room - LEAF:
-                    most = (wanted + lists.room - LEAF) // 2
-                    limit = float(0.0)
-                    for member in range(members):
-                        q = first + member * lists.pitch
-                        count = filled[slot + member]
-                        if count > lists.room - LEAF:
-                            within[slot + member] = _keep_least(
-                                nearest, q, lists.step, count, wanted, most, filled, slot + member
-                            )
-                        limit = wp.max(limit, within[slot + member])
-                at = next_node(at, root)
-        if root != node:
-            node = node >> 1
-        root = node ^ 1
-        if node == 1:
-            node = 0
-    for member in range(members):
-        q = first + member * lists.pitch
-        count = filled[slot + member]
-        if count > wanted and wanted > 0:
-            _keep_least(nearest, q, lists.step, count, wanted, wanted, filled, slot + member)
-        total = wp.float64(0.0)
-        for k in range(wanted):
-            if k < count:
-                total += wp.sqrt(wp.float64(nearest[q + k * lists.step]))
-            else:
-                total += _FARTHEST  # whose square no float32 holds
-        mean[begin + member] = float(total / wp.float64(wp.max(wanted, 1)))
 
 
 @wp.kernel
@@ -365,50 +229,76 @@ def _mean_distances(
     # out
     mean_out: wp.array(dtype=wp.float32),
 ):
-    """One leaf a thread; the lists of many threads lie side by side."""
+    """The mean distances of a leaf's points to their nearest neighbours: all together, from the leaf on upwards."""
     leaf = wp.tid()
     size = size_in[0]
-    first = leaf * LEAF
-    if first < size:
-        _mean_distances_of(
-            leaf, size, points_in, x_in, y_in, z_in, low_in, high_in, leaves, neighbors,
-            lists, first, first, nearest, filled, within, mean_out,
-        )  # fmt: skip
-
-
-@wp.kernel
-def _mean_distances_in_parts(
-    part: int,
-    parts: int,
-    # in
-    points_in: wp.array(dtype=wp.vec3),
-    x_in: wp.array(dtype=Eight),
-    y_in: wp.array(dtype=Eight),
-    z_in: wp.array(dtype=Eight),
-    size_in: wp.array(dtype=wp.int32),
-    low_in: wp.array(dtype=wp.vec3),
-    high_in: wp.array(dtype=wp.vec3),
-    leaves: int,
-    neighbors: int,
-    lists: _Lists,
-    # in out: of each point of a leaf its list, how many it has, and within what they are
-    nearest: wp.array(dtype=wp.float32),
-    filled: wp.array(dtype=wp.int32),
-    within: wp.array(dtype=wp.float32),
-    # out
-    mean_out: wp.array(dtype=wp.float32),
-):
-    """Every so many runs of leaves, so that crowded places are shared out; a part's lists stay in its cache."""
-    size = size_in[0]
-    first = part * lists.room * LEAF
-    slot = part * _SLOTS
-    used = (size + LEAF - 1) // LEAF
-    for run in range(part, (used + _RUN - 1) // _RUN, parts):
-        for leaf in range(run * _RUN, wp.min((run + 1) * _RUN, used)):
-            _mean_distances_of(
-                leaf, size, points_in, x_in, y_in, z_in, low_in, high_in, leaves, neighbors,
-                lists, first, slot, nearest, filled, within, mean_out,
-            )  # fmt: skip
+    begin = leaf * LEAF
+    if begin >= size:
+        return
+    members = wp.min(LEAF, size - begin)
+    wanted = wp.min(neighbors, size - 1)
+    own_low = low_in[leaves + leaf]
+    own_high = high_in[leaves + leaf]
+    # How far the neighbours of the leaf's centre are, at most: by the points next in the order.
+    centre = 0.5 * own_low + 0.5 * own_high
+    found = int(0)
+    for other in range(wp.max(leaf - _WINDOW, 0), wp.min(leaf + _WINDOW, leaves - 1) + 1):
+        found = _append(centre, x_in[other], y_in[other], z_in[other], _LARGEST, nearest, begin, lists.step, found)
+    reach = float(wp.inf)
+    if found > wanted:
+        reach = wp.sqrt(_keep_least(nearest, begin, lists.step, found, wanted + 1, wanted + 1, filled, begin))
+    limit = float(0.0)
+    for member in range(members):
+        filled[begin + member] = 0
+        way = reach + wp.length(points_in[begin + member] - centre)
+        within[begin + member] = way * way * 1.00001 + 1.0e-37
+        limit = wp.max(limit, within[begin + member])
+    node = leaves + leaf
+    root = int(node)
+    while node > 0 and wanted > 0:
+        at = int(root)
+        while at > 0:
+            low_at = low_in[at]
+            high_at = high_in[at]
+            if _gap_squared_between(own_low, own_high, low_at, high_at) >= limit:
+                at = next_node(at, root)
+            elif at < leaves:
+                at = 2 * at
+            else:
+                other = at - leaves
+                longest = _visit(
+                    members, x_in[leaf], y_in[leaf], z_in[leaf], other == leaf, low_at, high_at,
+                    x_in[other], y_in[other], z_in[other], nearest, begin, lists.step, begin, within, filled,
+                )  # fmt: skip
+                if longest > lists.room - LEAF:
+                    most = (wanted + lists.room - LEAF) // 2
+                    limit = float(0.0)
+                    for member in range(members):
+                        q = begin + member
+                        count = filled[begin + member]
+                        if count > lists.room - LEAF:
+                            within[begin + member] = _keep_least(
+                                nearest, q, lists.step, count, wanted, most, filled, begin + member
+                            )
+                        limit = wp.max(limit, within[begin + member])
+                at = next_node(at, root)
+        if root != node:
+            node = node >> 1
+        root = node ^ 1
+        if node == 1:
+            node = 0
+    for member in range(members):
+        q = begin + member
+        count = filled[begin + member]
+        if count > wanted and wanted > 0:
+            _keep_least(nearest, q, lists.step, count, wanted, wanted, filled, begin + member)
+        total = wp.float64(0.0)
+        for k in range(wanted):
+            if k < count:
+                total += wp.float64(wp.sqrt(nearest[q + k * lists.step]))
+            else:
+                total += _FARTHEST  # whose square no float32 holds
+        mean_out[begin + member] = float(total / wp.float64(wp.max(wanted, 1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -437,22 +327,24 @@ class NeighborDistances:
             object.__setattr__(self, name, value)
 
         keep("tree", tree)
+        held = tree.leaves * int(LEAF)
         lists = _Lists()
         lists.room = max(2 * self.neighbors + 4 * int(LEAF), (2 * int(_WINDOW) + 2) * int(LEAF))
+        lists.step = held
+        keep("_lists", lists)
+        keep("_eights", [wp.zeros(tree.leaves, dtype=Eight, device=device) for _ in range(3)])
         if device.is_cpu:
             keep("_parts", thread_count())
-            lists.pitch, lists.step = lists.room, 1
-            held, slots = self._parts * int(LEAF), self._parts * int(_SLOTS)
+            keep("_boxes", wp.zeros((6, 2 * tree.leaves), dtype=wp.float32, device=device))
+            keep("_rows", wp.zeros((self._parts, 8 * rows_for(self.neighbors)), dtype=wp.float32, device=device))
         else:
-            held = slots = tree.leaves * int(LEAF)
-            lists.pitch, lists.step = 1, held
-        if lists.room * held > 2**31 - 1:
-            raise ValueError(f"neighbors {self.neighbors} of capacity {self.capacity} points are too many for one plan")
-        keep("_lists", lists)
-        keep("_nearest", wp.zeros(lists.room * held, dtype=wp.float32, device=device))
-        keep("_filled", wp.zeros(slots, dtype=wp.int32, device=device))
-        keep("_within", wp.zeros(slots, dtype=wp.float32, device=device))
-        keep("_eights", [wp.zeros(tree.leaves, dtype=Eight, device=device) for _ in range(3)])
+            if lists.room * held > 2**31 - 1:
+                raise ValueError(
+                    f"neighbors {self.neighbors} of capacity {self.capacity} points are too many for one plan"
+                )
+            keep("_nearest", wp.zeros(lists.room * held, dtype=wp.float32, device=device))
+            keep("_filled", wp.zeros(held, dtype=wp.int32, device=device))
+            keep("_within", wp.zeros(held, dtype=wp.float32, device=device))
         keep("mean", wp.zeros(self.capacity, dtype=wp.float32, device=device))
 
     def launch(self, xyz: wp.array, count: wp.array) -> None:
@@ -462,12 +354,16 @@ class NeighborDistances:
             xyz: Positions [m], shape (n,), vec3, n ≤ capacity.
             count: Shape (1,), int32.
         """
-        tree = self.tree
+        tree, device = self.tree, self.mean.device
         tree.build(xyz, count)
-        wp.launch(lay_out, tree.leaves, inputs=[tree.points, tree.size], outputs=self._eights, device=self.mean.device)
-        inputs = [tree.points, *self._eights, tree.size, tree.low, tree.high, tree.leaves, self.neighbors, self._lists]
-        outputs = [self._nearest, self._filled, self._within, self.mean]
-        if self.mean.device.is_cpu:
-            launch_parts(_mean_distances_in_parts, parts_for(xyz.shape[0], self._parts), inputs, outputs)
+        wp.launch(lay_out, tree.leaves, inputs=[tree.points, tree.size], outputs=self._eights, device=device)
+        boxes = [tree.low, tree.high]
+        if device.is_cpu:
+            wp.launch(lay_out_boxes, 2 * tree.leaves, inputs=boxes, outputs=[self._boxes], device=device)
+            inputs = [tree.size, *self._eights, *boxes, self._boxes, tree.leaves, self.neighbors]
+            outputs = [self._rows, self.mean]
+            launch_parts(mean_distances_in_parts, parts_for(xyz.shape[0], self._parts), inputs, outputs)
         else:
-            wp.launch(_mean_distances, tree.leaves, inputs=inputs, outputs=outputs, device=self.mean.device)
+            inputs = [tree.points, *self._eights, tree.size, *boxes, tree.leaves, self.neighbors, self._lists]
+            outputs = [self._nearest, self._filled, self._within, self.mean]
+            wp.launch(_mean_distances, tree.leaves, inputs=inputs, outputs=outputs, device=device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from .neighbor_distances import Eight
+from .leaf_lanes import Eight
 from .point_tree import LEAF
 
 __all__ = ["Reach", "find_lonely_in_parts"]

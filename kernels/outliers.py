@@ -15,7 +15,8 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 from .interop import borrow_points, count_on, give
-from .neighbor_distances import Eight, NeighborDistances, lay_out, parts_for
+from .leaf_lanes import Eight, lay_out, parts_for
+from .neighbor_distances import NeighborDistances
 from .outlier_parts import Reach, find_lonely_in_parts
 from .plan import capacity_for, plan_for
 from .point_tree import LEAF, PointTree, gap_squared, next_node

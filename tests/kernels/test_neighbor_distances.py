@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from warploom.kernels import neighbor_distances
-from warploom.kernels.neighbor_distances import NeighborDistances, parts_for
+from warploom.kernels.leaf_lanes import parts_for
+from warploom.kernels.neighbor_distances import NeighborDistances
 from warploom.kernels.threads import set_thread_count, thread_count
 
 # Float32 loses this share of a distance between coordinates near zero.
@@ -72,8 +73,7 @@ def test_lists_side_by_side_give_the_same_bytes():
     plan = NeighborDistances(capacity=len(points), neighbors=20, device="cpu")
     plan.launch(wp.array(points, dtype=wp.vec3, device="cpu"), wp.array([len(points)], dtype=wp.int32, device="cpu"))
     tree, held = plan.tree, 8 * plan.tree.leaves
-    lists = neighbor_distances._Lists()
-    lists.room, lists.pitch, lists.step = plan._lists.room, 1, held
+    lists = plan._lists
     mean = wp.zeros_like(plan.mean)
     wp.launch(
         neighbor_distances._mean_distances,
