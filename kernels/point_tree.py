@@ -14,6 +14,7 @@ from typing import Any
 import warp as wp
 
 from .device import DEFAULT_DEVICE, resolve_device
+from .point_lanes import LOAD_POINTS
 
 __all__ = ["LEAF", "PointTree", "gap_squared", "next_node"]
 
@@ -25,9 +26,7 @@ LEAF = wp.constant(8)
 
 _CHUNK = wp.constant(256)
 _AXIS_BITS = 16
-_SORTED_BITS = 32  # the highest of the key: as many as a CPU sorts in two passes; what is finer stays as it came
-_LAST_CELL = wp.constant(65535.0)
-_NOWHERE = wp.constant(wp.int64(1 << 48))  # behind all points: no point, or one that is not finite
+_SAMPLE = 64  # points whose spread tells how wide the curve is
 _HIGHEST = 2**31 - 1
 
 
@@ -88,14 +87,112 @@ def _bound_points(
         wp.atomic_add(size, 0, found)
 
 
-@wp.func
-def _spread(cell: int) -> wp.int64:
-    """Sixteen bits, two zeros between each."""
-    x = wp.int64(cell)
-    x = (x | (x << wp.int64(16))) & wp.int64(0x0000FF0000FF)
-    x = (x | (x << wp.int64(8))) & wp.int64(0x00F00F00F00F)
-    x = (x | (x << wp.int64(4))) & wp.int64(0x0C30C30C30C3)
-    return (x | (x << wp.int64(2))) & wp.int64(0x249249249249)
+@wp.func_native(
+    f"""
+    constexpr int SAMPLE = {_SAMPLE};"""
+    """
+    float sample[SAMPLE];
+    int size = 0;
+    const char* const rows = (const char*)xyz.data;
+    for (int k = 0; k < SAMPLE; ++k) {
+        const float* const row = (const float*)(rows + (long long)k * n / SAMPLE * xyz.strides[0]);
+        if ((row[0] - row[0]) + (row[1] - row[1]) + (row[2] - row[2]) != 0.0f) continue;
+        int place = size++;
+        for (; place > 0 && sample[place - 1] > row[axis]; --place) sample[place] = sample[place - 1];
+        sample[place] = row[axis];
+    }
+    if (size == 0) return wp::vec2(low, high);
+    const float first = sample[size / 8], last = sample[size - 1 - size / 8], room = 4.0f * (last - first);
+    if (room == 0.0f) return wp::vec2(low, high);
+    return wp::vec2(wp::max(low, first - room), wp::min(high, last + room));
+"""
+)
+def _width_along(xyz: wp.array(dtype=wp.vec3), n: int, axis: int, low: float, high: float) -> wp.vec2:
+    """From where to where most of the points are, and some more; of all that they reach at most."""
+    return wp.vec2(low, high)
+
+
+@wp.kernel
+def _find_width(
+    # in
+    xyz_in: wp.array(dtype=wp.vec3),
+    count_in: wp.array(dtype=wp.int32),
+    bounds: wp.array(dtype=wp.int32),
+    # out: lowest corner, highest corner
+    width_out: wp.array(dtype=wp.float32),
+):
+    """How wide the curve is, an axis a thread: a few points far away do not make its cells too large for the rest."""
+    axis = wp.tid()
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    low = _value(bounds[axis])
+    high = _value(-bounds[axis + 3])
+    if n > 0:
+        width = _width_along(xyz_in, n, axis, low, high)
+        low = width[0]
+        high = width[1]
+    width_out[axis] = low
+    width_out[axis + 3] = high
+
+
+# A block of points at a time, without a branch, which a compiler makes vector instructions of.
+@wp.func_native(
+    f"""
+    constexpr int AXIS_BITS = {_AXIS_BITS}, CHUNK = {_CHUNK};
+    #ifdef __CUDA_ARCH__
+    constexpr int BLOCK = 1;
+    #else
+    constexpr int BLOCK = CHUNK;
+    #endif"""
+    + LOAD_POINTS
+    + """
+    const float* const low = width.data;
+    // Halved, so that the extent of any finite points is finite.
+    float extent = 0.0f;
+    for (int axis = 0; axis < 3; ++axis) {
+        const float along = 0.5f * low[axis + 3] - 0.5f * low[axis];
+        extent = along > extent ? along : extent;
+    }
+    const float whole = extent > 0.0f ? extent : 1.0f, last_cell = (1 << AXIS_BITS) - 1;
+    float along[3][BLOCK];
+    const long long step = xyz.strides[0] / 4;
+    const int length = end - begin, used = wp::max(wp::min(n, end) - begin, 0);
+    load_points((const float*)xyz.data + step * begin, step, used, along);
+    long long* const keys = key.data + begin;
+    int* const order = index.data + begin;
+    for (int k = 0; k < length; ++k) order[k] = begin + k;
+    for (int k = 0; k < used; ++k) {
+        const float x = along[0][k], y = along[1][k], z = along[2][k];
+        const bool is_finite = (x - x) + (y - y) + (z - z) == 0.0f;
+        unsigned long long place = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            float share = (0.5f * (is_finite ? along[axis][k] : 0.0f) - 0.5f * low[axis]) / whole;
+            share = share > 0.0f ? share : 0.0f;
+            share = share < 1.0f ? share : 1.0f;
+            // Sixteen bits, two zeros between each.
+            unsigned long long spread = (unsigned)(int)(share * last_cell);
+            spread = (spread | spread << 16) & 0x0000FF0000FFull;
+            spread = (spread | spread << 8) & 0x00F00F00F00Full;
+            spread = (spread | spread << 4) & 0x0C30C30C30C3ull;
+            spread = (spread | spread << 2) & 0x249249249249ull;
+            place |= spread << (2 - axis);
+        }
+        keys[k] = is_finite ? place : 1ull << (3 * AXIS_BITS);
+    }
+    for (int k = used; k < length; ++k) keys[k] = 1ll << (3 * AXIS_BITS);
+    return length;
+"""
+)
+def _key_block(
+    begin: int,
+    end: int,
+    xyz: wp.array(dtype=wp.vec3),
+    n: int,
+    width: wp.array(dtype=wp.float32),
+    key: wp.array(dtype=wp.int64),
+    index: wp.array(dtype=wp.int32),
+) -> int:
+    """The places of the points begin … end − 1 along the curve; behind all if there is no finite one."""
+    return 0
 
 
 @wp.kernel
@@ -103,31 +200,17 @@ def _key_points(
     # in
     xyz_in: wp.array(dtype=wp.vec3),
     count_in: wp.array(dtype=wp.int32),
-    bounds: wp.array(dtype=wp.int32),
+    width: wp.array(dtype=wp.float32),
+    capacity: int,
+    block: int,
     # out
     key_out: wp.array(dtype=wp.int64),
     index_out: wp.array(dtype=wp.int32),
 ):
-    """The place of each point along the curve; dim is the capacity, so that the sort finds no leftovers."""
-    i = wp.tid()
-    index_out[i] = i
-    key = _NOWHERE
-    if i < wp.min(count_in[0], xyz_in.shape[0]):
-        p = xyz_in[i]
-        if _is_finite(p):
-            low = wp.vec3(_value(bounds[0]), _value(bounds[1]), _value(bounds[2]))
-            high = wp.vec3(_value(-bounds[3]), _value(-bounds[4]), _value(-bounds[5]))
-            # Halved, so that the extent of any finite points is finite.
-            extent = wp.max(0.5 * high - 0.5 * low)
-            share = wp.vec3(0.0)
-            if extent > 0.0:
-                share = (0.5 * p - 0.5 * low) / extent
-            key = (
-                _spread(int(wp.clamp(share[0], 0.0, 1.0) * _LAST_CELL)) << wp.int64(2)
-                | _spread(int(wp.clamp(share[1], 0.0, 1.0) * _LAST_CELL)) << wp.int64(1)
-                | _spread(int(wp.clamp(share[2], 0.0, 1.0) * _LAST_CELL))
-            )
-    key_out[i] = key
+    """The place of each point along the curve, for the whole capacity, so that the sort finds no leftovers."""
+    begin = wp.tid() * block
+    n = wp.min(count_in[0], xyz_in.shape[0])
+    _key_block(begin, wp.min(begin + block, capacity), xyz_in, n, width, key_out, index_out)
 
 
 @wp.kernel
@@ -237,6 +320,7 @@ class PointTree:
 
         keep("leaves", 1 << (-(-self.capacity // LEAF) - 1).bit_length())
         buffer("_bounds", 6, wp.int32)
+        buffer("_width", 6, wp.float32)
         buffer("_keys", 2 * self.capacity, wp.int64)  # a sort needs twice the room
         keep("index", buffer("_indices", 2 * self.capacity, wp.int32)[: self.capacity])
         buffer("size", 1, wp.int32)
@@ -260,9 +344,12 @@ class PointTree:
 
         run(_reset, 1, [], [self._bounds, self.size])
         run(_bound_points, -(-n // _CHUNK), [xyz, count], [self._bounds, self.size])
-        run(_key_points, self.capacity, [xyz, count, self._bounds], [self._keys, self._indices])
-        end = 3 * _AXIS_BITS + 1
-        wp.utils.radix_sort_pairs(self._keys, self._indices, self.capacity, begin_bit=end - _SORTED_BITS, end_bit=end)
+        run(_find_width, 3, [xyz, count, self._bounds], [self._width])
+        block = int(_CHUNK) if self.size.device.is_cpu else 1
+        given = [xyz, count, self._width, self.capacity, block]
+        run(_key_points, -(-self.capacity // block), given, [self._keys, self._indices])
+        # Less the lowest bit it takes a CPU a pass less.
+        wp.utils.radix_sort_pairs(self._keys, self._indices, self.capacity, begin_bit=1, end_bit=3 * _AXIS_BITS + 1)
         run(
             _bound_leaves,
             self.leaves,

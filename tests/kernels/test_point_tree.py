@@ -51,6 +51,26 @@ def test_neighbours_in_the_order_are_neighbours_in_space():
     assert np.median(extent.prod(axis=1)) * tree.leaves < 1.0
 
 
+def test_a_few_points_far_away_leave_the_order_of_the_others_as_good():
+    """Also where they are a million times as far as the others are wide, and the others come in no order."""
+    points = np.random.default_rng(3).uniform(0, 1, (8192, 3)).astype(np.float32)
+    points[:8] = [(x, y, z) for x in (-1e6, 1e6) for y in (-1e6, 1e6) for z in (-1e6, 1e6)]
+    tree = build(points)
+    assert_holds(tree, points)
+    extent = (tree.high.numpy() - tree.low.numpy())[tree.leaves :]
+    assert np.median(extent.prod(axis=1)) * tree.leaves < 2.0
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5])
+def test_rows_that_are_apart_in_memory(columns):
+    points = np.random.default_rng(4).normal(0, 5, (1001, columns)).astype(np.float32)
+    points[7, 0], points[500, 2] = np.nan, np.inf
+    rows = wp.array(ptr=points.ctypes.data, dtype=wp.vec3, shape=1001, strides=(4 * columns,), device="cpu")
+    tree = PointTree(capacity=2000)
+    tree.build(rows, wp.array([1001], dtype=wp.int32, device="cpu"))
+    assert_holds(tree, points[:, :3])
+
+
 def test_level_by_level_bounds_the_same_nodes():
     """As on a GPU; on a CPU one thread bounds them all."""
     tree = build(np.random.default_rng(2).normal(0, 5, (777, 3)).astype(np.float32))
