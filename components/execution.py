@@ -65,6 +65,8 @@ class ExecutionContext:
     """Names of the sensors by kind."""
     latency_budget_ms: float = 100.0
     """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
+    handover: Path | None = None
+    """Where components leave what their next life goes on with, should the process be killed; None: nowhere."""
     timings: Timings = field(default_factory=Timings, compare=False)
     """Tells the runs of vertices, if the process was built with it as its `on_timing`."""
 

@@ -10,7 +10,7 @@ import json
 import logging
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -170,8 +170,11 @@ def build_process(
     imports: Collection[str],
     *,
     prepare: bool = True,
+    handover: Path | None = None,
 ) -> Process:
     """Makes a process of a profile; nothing is started. Without `prepare` it is only to be looked at.
+
+    Its components leave in the folder `handover` what the next life of the process goes on with.
 
     Raises:
         ConfigError: A module does not fit.
@@ -181,7 +184,7 @@ def build_process(
     hand_over(files, set(imports))
     # Where the CPU is meant nobody need be asked for it: Warp is loaded by the components that compute with it.
     device = "cpu" if profile.content.device == "cpu" else profile_device(profile.content)
-    context = execution_context(profile, device)
+    context = replace(execution_context(profile, device), handover=handover)
     return Process(
         files,
         context=context,
@@ -249,11 +252,14 @@ def run_launch(
 
 def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks, Sequence[str]]:
     """What a child runs, by its plan file."""
+    from ..dag.launch.run_folder import RunFolder
+
     profile = load_profile(told["profile"], {tuple(key.split(".")): v for key, v in told["profile_changes"].items()})
     use_threads(profile.content)
     changes = {tuple(key.split(".")): value for key, value in told["changes"].items()}
     files = [load_module(Path(path), changes, profile.content.sensor_names) for path in told["modules"]]
-    process = build_process(files, profile, told["links"]["imports"])
+    handover = RunFolder(told["node"]).handover(told["process"]["name"])
+    process = build_process(files, profile, told["links"]["imports"], handover=handover)
     from ..dag.launch.linking import LinkPlan, Links
     from ..datamesh.transport import SharedMemoryConfig, ZenohConfig
 

@@ -2,15 +2,16 @@
 
 A simulator or a decoder may be slower than the sensor, so frames are made ahead: the first seconds of a drive, which
 are then played to and fro. Each frame follows the one before it by one period of motion, forwards or backwards, so
-that what perceives it sees one continuous drive however long it lasts. Where the simulator plays, it plays the cameras
-and radars of the profile too, at the level of objects.
+that what perceives it sees one continuous drive however long it lasts. A sensor goes on while its driver is dead, but
+a simulated street takes seconds to build: so the frames are left to the next life of the process, which plays them at
+once. Where the simulator plays, it plays the cameras and radars of the profile too, at the level of objects.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
@@ -23,6 +24,7 @@ from ...datamesh.clock import Timer
 from ...errors import WarploomError
 from ..execution import ExecutionContext
 from ..messages import CameraSet, RadarSet, SensorFrame
+from .handover import Handover
 from .transforms import mounting_matrix
 
 __all__ = ["LidarDriver", "LidarDriverConfig"]
@@ -135,6 +137,11 @@ class LidarDriver(Component):
             return f"{self._uri}: {self._failure}"
         return f"{self._uri} is at its end" if self._phase == "ended" else None
 
+    @property
+    def starting_because(self) -> str | None:
+        """What is done before the first sweep can come."""
+        return f"makes frames of {self._uri} ahead" if self._phase == "making frames" else None
+
     def state(self) -> Mapping[str, str | float | int]:
         """What plays it, and how many sweeps it gave."""
         return {
@@ -172,22 +179,19 @@ class LidarDriver(Component):
 
     def _frames(self) -> Iterator[SensorFrame]:
         """The sweeps in the order in which they are played."""
-        from ..sources import open_source
-
-        context = self.context or ExecutionContext()
-        source = open_source(self._uri, device=context.device)
-        if hasattr(source, "suite"):
-            self._equip(source, context)
         if self._config.play == "once":
-            yield from source
+            yield from self._open()
             return
-        made: list[SensorFrame] = []
-        for frame in source:
-            if self._stopping.is_set():
-                return
-            made.append(frame)
-            if len(made) * self._period_ns >= self._config.ahead_s * 1e9:
-                break
+        handover = Handover((self.context or ExecutionContext()).handover, self.name, self._origin())
+        made: list[SensorFrame] = handover.take()
+        if not made:
+            for frame in self._open():
+                if self._stopping.is_set():
+                    return
+                made.append(frame)
+                if len(made) * self._period_ns >= self._config.ahead_s * 1e9:
+                    break
+            handover.leave(made)
         last = len(made) - 1
         position, step = 0, 1
         while made:
@@ -196,6 +200,25 @@ class LidarDriver(Component):
             if not 0 <= position + step <= last:
                 step = -step
             position = min(max(position + step, 0), last)
+
+    def _open(self) -> Iterable[SensorFrame]:
+        """What plays the sensor, opened."""
+        from ..sources import open_source
+
+        context = self.context or ExecutionContext()
+        source = open_source(self._uri, device=context.device)
+        if hasattr(source, "suite"):
+            self._equip(source, context)
+        return source
+
+    def _origin(self) -> str:
+        """All that the frames made ahead are made of."""
+        context = self.context or ExecutionContext()
+        lidar = getattr(context.sensors.get(self._config.sensor), "mounting", None)
+        mounted = {
+            kind: {name: at.tolist() for name, at in self._mounted(kind).items()} for kind in ("camera", "radar")
+        }
+        return repr((self._uri, self._period_ns, self._config.model_dump(), lidar, mounted))
 
     def _mounted(self, kind: str) -> dict[str, np.ndarray]:
         """Vehicle from sensor, of those of a kind in the profile that say where they are."""

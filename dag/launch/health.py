@@ -80,12 +80,15 @@ class ProcessObserver:
         """One sign of life, as plain values; `hanging` says which parts have been at one frame for too long."""
         now = self._clock()
         idle: dict[str, str] = {}
+        starting: dict[str, str] = {}
         state: dict[str, dict[str, Any]] = {}
         for name, component in self._process.components.items():
             said = getattr(component, "instance", component)
             reason = getattr(said, "idle_because", None)
             if reason:
                 idle[name] = str(reason)
+            if reason := getattr(said, "starting_because", None):
+                starting[name] = str(reason)
             tell = getattr(said, "state", None)
             if callable(tell):
                 try:
@@ -103,6 +106,7 @@ class ProcessObserver:
             "losses": self._process.mesh.losses.as_dict(),
             "links": {topic: dict(counts) for topic, counts in self._counters().items()},
             "idle": idle,
+            "starting": starting,
             "state": state,
         }
 

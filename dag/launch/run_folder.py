@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import shutil
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +16,7 @@ __all__ = ["RotatedLog", "RunFolder", "run_base", "running_nodes"]
 
 _LOG_BYTES = 10_000_000
 _LOGS = 5
+_HANDOVER = "handover"
 _SOCKET_BYTES = 100  # a path of a Unix socket has at most 107
 
 
@@ -70,6 +72,7 @@ class RunFolder:
         lock.flush()
         self._lock = lock
         self.control.unlink(missing_ok=True)
+        self._end_handover()
 
     def _make(self) -> None:
         made = run_folder(self.node)  # where the links of the node meet, too
@@ -84,11 +87,20 @@ class RunFolder:
         self.control.unlink(missing_ok=True)
         for plan in (self.path / "plan").glob("*.json"):
             plan.unlink(missing_ok=True)
+        self._end_handover()
         if self._lock is not None:
             with contextlib.suppress(OSError):
                 self._lock.truncate(0)
             self._lock.close()
             self._lock = None
+
+    def handover(self, process: str) -> Path:
+        """Where a process leaves what its next life goes on with; it makes the folder itself."""
+        return self.path / _HANDOVER / process
+
+    def _end_handover(self) -> None:
+        """Removes what the processes have left: what comes after a supervisor's end may be another node."""
+        shutil.rmtree(self.path / _HANDOVER, ignore_errors=True)
 
     def owner(self) -> int | None:
         """The process that holds the lock; None: nobody does."""

@@ -51,6 +51,7 @@ def _process(process: SupervisedProcess) -> dict[str, Any]:
                 "name": name,
                 "kind": component.get("kind"),
                 "idle_because": beat.get("idle", {}).get(name),
+                "starting_because": beat.get("starting", {}).get(name),
                 "state": beat.get("state", {}).get(name, {}),
                 "losses": beat.get("losses", {}).get(name, {}),
             }

@@ -120,6 +120,8 @@ class SupervisedProcess:
         self._stop_wish = asyncio.Event()
         self._hurry_s: float | None = None
         self._numbers = 0
+        self._serving = False
+        self._exports: set[str] = set()
         self.changed = asyncio.Condition()
 
     @property
@@ -180,6 +182,7 @@ class SupervisedProcess:
                 code = await self._one_life()
                 if self._asked_to_stop:
                     break
+                self._forget_life()
                 wait = await self._after_death(code)
                 if wait is None:
                     return
@@ -191,6 +194,13 @@ class SupervisedProcess:
             await self._enter(State.STOPPED, code=self.exit_code)
         finally:
             self._printed.close()
+
+    def _forget_life(self) -> None:
+        """What a dead one said holds no more; what is read of it will be read of the next."""
+        links = self.beat.get("links", {})
+        self._exports = {topic for topic in self._exports if links.get(topic, {}).get("readers")}
+        self.beat = {}
+        self._serving = False
 
     async def _after_death(self, code: int) -> float | None:
         """What follows a death that nobody asked for: how long to wait for the next start [s]; None: there is none."""
@@ -279,14 +289,17 @@ class SupervisedProcess:
     async def _take_report(self, life: Life, report: dict[str, Any]) -> bool:
         """Takes what the process said; True where it began to run with it."""
         kind = report.get("report")
-        if kind in ("running", "beat", "stopped"):
-            self.beat = report
+        if kind in ("beat", "stopped"):
+            self._take_beat(report)
         if kind == "ready" and self.state is State.BUILDING:
             self.components = report.get("components", {})
             await self._enter(State.READY, seconds=round(time.monotonic() - life.started, 3))
         elif kind == "running" and self.state is State.READY:
             self._ran = True
             await self._enter(State.RUNNING, pid=life.process.pid)
+            self._take_beat(self.beat or report)  # beats do not queue behind what is to be acted on
+            for topic in self._exports:  # who listens goes on listening
+                life.send({"do": "export", "topic": topic})
             return True
         elif kind in ("failed", "broke"):
             life.error = str(report.get("error", ""))
@@ -354,6 +367,18 @@ class SupervisedProcess:
             raise ConnectionError(f"process {self.name!r} does not listen")
         return await asyncio.wait_for(answer, timeout_s)
 
+    async def export(self, topic: str) -> str:
+        """Lets it send a topic to whoever asks, in its later lives too while somebody reads; gives why not, or "".
+
+        Raises:
+            TimeoutError: It does not answer in time.
+            ConnectionError: It does not run.
+        """
+        answer = await self.ask({"do": "export", "topic": topic})
+        if "error" not in answer:
+            self._exports.add(topic)
+        return str(answer.get("error", ""))
+
     async def _begin(self) -> Life:
         """Starts the process where and as the launch file says.
 
@@ -381,6 +406,10 @@ class SupervisedProcess:
 
     def _take_beat(self, beat: Mapping[str, Any]) -> None:
         self.beat = beat
+        life = self._life
+        if life is not None and not self._serving and self.state is State.RUNNING and not beat.get("starting"):
+            self._serving = True
+            self._tell("serving", seconds=round(time.monotonic() - life.started, 3))
 
     def _kill_hanging(self, life: Life) -> None:
         """Has its threads printed into its log, then asks it to end; SIGKILL comes later."""

@@ -275,9 +275,8 @@ class Supervisor:
     async def _export(self, request: Mapping[str, Any]) -> dict[str, Any]:
         topic = str(request.get("topic", ""))
         process = self.producer(topic)
-        answer = await process.ask({"do": "export", "topic": topic})
-        if "error" in answer:
-            raise ConfigError(f"topic {topic!r}: {answer['error']}")
+        if refused := await process.export(topic):
+            raise ConfigError(f"topic {topic!r}: {refused}")
         return {"process": process.name, "topic": topic}
 
     async def _restart(self, request: Mapping[str, Any]) -> dict[str, Any]:

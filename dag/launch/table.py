@@ -87,7 +87,14 @@ def event_text(event: Mapping[str, Any]) -> str:
 
 
 def _style(event: Mapping[str, Any]) -> str:
-    return {"died": "red", "hangs": "red", "warning": "yellow", "up": "green", "ending": "bold"}.get(event["event"], "")
+    return {
+        "died": "red",
+        "hangs": "red",
+        "warning": "yellow",
+        "up": "green",
+        "serving": "green",
+        "ending": "bold",
+    }.get(event["event"], "")
 
 
 def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None) -> Table:
@@ -104,8 +111,12 @@ def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = N
         table.add_column(name, justify="left" if name in ("process", "state") else "right", no_wrap=True)
     table.add_column("says", overflow="fold")
     for process in status["processes"]:
-        idle = sum(bool(component["idle_because"]) for component in process["components"])
+        idle, starting = (
+            sum(bool(component.get(why)) for component in process["components"])
+            for why in ("idle_because", "starting_because")
+        )
         says = [f"{len(process['components'])} components" + (f", {idle} of them idle" if idle else "")]
+        says += [f"{starting} of them not ready to serve yet"] if starting else []
         says += process["warnings"]
         if process["last_death"]:
             says.append(f"last death: {process['last_death']}")
@@ -136,6 +147,8 @@ def component_table(status: Mapping[str, Any]) -> Table:
             says = [f"{key} {value}" for key, value in component["state"].items()]
             if component["idle_because"]:
                 says.insert(0, f"idle: {component['idle_because']}")
+            if component.get("starting_because"):
+                says.insert(0, f"starting: {component['starting_because']}")
             says += [f"lost {count} ({reason})" for reason, count in component["losses"].items()]
             style = "dim" if component["idle_because"] else ""
             table.add_row(process["name"], component["name"], str(component["kind"]), ", ".join(says), style=style)

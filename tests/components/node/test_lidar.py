@@ -13,6 +13,7 @@ from warploom.components.node.lidar import LidarDriver, LidarDriverConfig
 from warploom.components.profile import MountingSpec, SensorSpec
 from warploom.datamesh import DataMesh
 from warploom.datamesh.clock import ManualClock
+from warploom.datamesh.messages import encode
 from warploom.errors import SourceError
 
 PERIOD = 100_000_000
@@ -44,10 +45,10 @@ def until(condition):
 class Driven:
     """A driver on a clock that is moved by hand, and what it committed."""
 
-    def __init__(self, clock, config):
+    def __init__(self, clock, config, context=None):
         self.clock = clock
         self.mesh = DataMesh(clock=clock)
-        self.driver = LidarDriver("driver", ExecutionContext())
+        self.driver = LidarDriver("driver", context or ExecutionContext())
         self.driver.bind(self.mesh, {"cloud": "raw", "cameras": "cameras", "radars": "radars"})
         self.driver.init(LidarDriverConfig.model_validate({"sensor": "roof", **config}))
         self.came, self.cameras, self.radars = [], [], []
@@ -144,6 +145,26 @@ def test_a_single_frame_stands_still(drive):
     assert [int(entry.value.points[0, 0]) for entry in driven.came] == [0, 0, 0, 0]
 
 
+def test_the_next_life_of_its_process_plays_what_was_made_ahead_and_opens_nothing(monkeypatch, tmp_path):
+    opened = []
+
+    def source(uri, device=None):
+        opened.append(uri)
+        return with_others(3)
+
+    monkeypatch.setattr("warploom.components.sources.open_source", source)
+    context = ExecutionContext(handover=tmp_path / "process")
+    came = []
+    for config in ({}, {}, {"seed": 8}):
+        driven = Driven(ManualClock(START), {"ahead_s": 0.3, **config}, context)
+        driven.periods(4)
+        driven.driver.stop()
+        came.append([encode(entry.value) for kind in (driven.came, driven.cameras, driven.radars) for entry in kind])
+        assert driven.driver.starting_because is None
+    assert came[0] == came[1]
+    assert [uri.partition("&")[0] for uri in opened] == ["sim:street?seed=7", "sim:street?seed=8"]
+
+
 def test_nothing_comes_between_two_sweeps(drive):
     driven = drive(frames(2), ahead_s=0.2)
     until(driven.waits)
@@ -212,6 +233,7 @@ def test_a_source_that_takes_for_ever_to_open_does_not_hold_up_the_stop(monkeypa
     driver.init(LidarDriverConfig(sensor="roof"))
     driver.start()
     assert opening.wait(10)
+    assert driver.starting_because == f"makes frames of {driver.source} ahead"
     driver.stop()
     assert mesh.losses["driver", "hung"] == 1
     assert "left to itself" in caplog.text

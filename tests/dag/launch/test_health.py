@@ -20,7 +20,7 @@ def test_several_beats_fit_into_the_timeout():
 @pytest.fixture
 def process(module, tmp_path, run_base):
     doubler = module(DOUBLER, "doubler", sent="ticks", topic="doubled")
-    plain = module(PLAIN, "plain", config="{idle: no receiver}")
+    plain = module(PLAIN, "plain", config="{idle: no receiver, starting: it warms up}")
     files = [load_module(tmp_path / name) for name in (doubler, plain)]
     return Process(files, external={"ticks": object})
 
@@ -50,6 +50,7 @@ def test_a_beat_tells_commits_rates_losses_and_what_parts_say(process):
     assert beat["commits"] == {"doubled": 4}
     assert beat["rates"] == {"doubled": 2.0}
     assert beat["idle"] == {"plain": "no receiver"}
+    assert beat["starting"] == {"plain": "it warms up"}
     assert beat["state"] == {"plain": {"answer": 42}}
     assert beat["links"] == links
     assert beat["hanging"] == []

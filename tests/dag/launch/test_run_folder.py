@@ -27,10 +27,14 @@ def test_it_is_its_owners_alone_and_locked_for_one_supervisor(run_base):
     with pytest.raises(ConfigError, match=r"node 'n' runs already \(process \d+\)"):
         other.open()
     one.plan("p").write_text("{}")
+    one.handover("p").mkdir(parents=True)
     one.close()
     assert running_nodes() == []
     assert not one.plan("p").exists()
+    assert not one.handover("p").exists()
+    one.handover("p").mkdir(parents=True)
     other.open()
+    assert not one.handover("p").exists(), "one that was killed has left it"
     other.close()
 
 

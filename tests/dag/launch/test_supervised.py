@@ -124,6 +124,43 @@ def test_every_end_that_nobody_asked_for_is_a_death(watched, behaviour, cause):
         assert one.process.last_death == "ended with exit code 1; RuntimeError: no sensor"
 
 
+def test_it_serves_once_all_its_parts_have_what_they_need(watched):
+    async def scenario(process):
+        await process.wait_for(State.RUNNING)
+        while process.beat.get("starting"):
+            await asyncio.sleep(0.01)
+        process.ask_to_stop()
+
+    one = watched(scenario, "warms up")
+    served = [event["event"] for event in one.events].index("serving")
+    running = one.events.index(one.find("state", state="running")[0])
+    assert running < served
+    assert one.find("serving")[0]["seconds"] >= 0.3
+    assert len(one.find("serving")) == len(watched(run_and_stop).find("serving")) == 1
+
+
+def test_who_listens_to_a_topic_hears_it_from_the_next_life_too(watched, tmp_path):
+    notes = tmp_path / "notes"
+
+    async def scenario(process):
+        await process.wait_for(State.RUNNING)
+        for topic in ("heard", "left"):
+            assert await process.export(topic) == ""
+        while not process.beat.get("links"):
+            await asyncio.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+        await process.wait_for(State.BACKING_OFF, State.BUILDING)
+        assert not process.beat, "what the dead one said last is not told of the next"
+        while len(notes.read_text().splitlines()) < 3:
+            await asyncio.sleep(0.01)
+        process.ask_to_stop()
+
+    watched(scenario, f"listened to, notes {notes}")
+    said = [line.split() for line in notes.read_text().splitlines()]
+    assert [topic for _, topic in said] == ["heard", "left", "heard"]
+    assert said[0][0] != said[2][0]
+
+
 @pytest.mark.parametrize("handler", ["exit", "ignore"])
 def test_other_handlers_start_nothing_again(watched, handler):
     one = watched(nothing, "dies at once", exception_handler=handler)

@@ -32,6 +32,14 @@ STATUS = {
             "components": [
                 {"name": "gnss", "kind": "generic X", "idle_because": "no receiver", "state": {}, "losses": {}},
                 {
+                    "name": "radar",
+                    "kind": "generic Y",
+                    "idle_because": None,
+                    "starting_because": "it warms up",
+                    "state": {},
+                    "losses": {},
+                },
+                {
                     "name": "lidar",
                     "kind": "Dag",
                     "idle_because": None,
@@ -62,15 +70,17 @@ def text(table):
 
 def test_processes_are_shown_with_what_they_say():
     shown = text(process_table(STATUS, {41: 12.34}))
-    for expected in ("compute", "running", "41", "1:02:05", "12.3", "3 MiB", "2 components, 1 of them idle", "nice -5"):
+    for expected in ("compute", "running", "41", "1:02:05", "12.3", "3 MiB", "3 components, 1 of them idle", "nice -5"):
         assert expected in shown
     assert "last death: was ended by SIGKILL" in shown
+    assert "1 of them not ready to serve yet" in shown
     assert "back off" in shown
 
 
 def test_components_say_why_they_are_idle_or_what_they_do():
     shown = text(component_table(STATUS))
     assert "idle: no receiver" in shown
+    assert "starting: it warms up" in shown
     assert "hz 10, lost 4 (backlog)" in shown
 
 

@@ -99,9 +99,9 @@ def note(path, version):
 class Plain:
     """A plain class that says what it does, and notes its start and stop."""
 
-    def __init__(self, path="", idle="", start_fails=False, dies="", ignores_stop=False):
+    def __init__(self, path="", idle="", starting="", start_fails=False, dies="", ignores_stop=False):
         self._path, self._start_fails, self._dies, self._ignores_stop = path, start_fails, dies, ignores_stop
-        self.idle_because = idle or None
+        self.idle_because, self.starting_because = idle or None, starting or None
         if dies == "build":
             os._exit(9)
         if dies == "stubborn build":

@@ -58,8 +58,12 @@ for order in orders():
         if behaviour == "breaks":
             say("broke", error="RuntimeError: no sensor")
             sys.exit(1)
-        say("running")
+        say("running", **({"starting": {"part": "it warms up"}} if behaviour == "warms up" else {}))
+        if behaviour == "warms up":
+            time.sleep(0.3)
         say("beat", hanging=["part.process at version 7 for 9.0 s"] if behaviour == "hangs" else [])
+        if behaviour.startswith("listened to, notes "):
+            say("beat", links={"heard": {"readers": 1}, "left": {"readers": 0}})
         if behaviour == "beats":
             import threading
 
@@ -83,4 +87,7 @@ for order in orders():
         say("stopped", hanging=[])
         sys.exit(0)
     elif order["do"] == "export" and behaviour != "deaf":
-        say("answer", id=order["id"], ok=True)
+        if behaviour.startswith("listened to, notes "):
+            with open(behaviour.removeprefix("listened to, notes "), "a") as notes:
+                notes.write(f"{os.getpid()} {order['topic']}\n")
+        say("answer", id=order.get("id"), ok=True)
