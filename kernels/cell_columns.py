@@ -16,7 +16,7 @@ from .cell_pairs import Radius, cell_of, is_finite
 from .column_sort import LAYOUT, LEFT_OUT, bits_for, sort_cells
 from .device import DEFAULT_DEVICE
 from .parts import part_start
-from .threads import PackedLaunch, launch_parts, thread_count
+from .threads import PackedLaunch, launch_parts, run_in_turn, thread_count
 from .unchecked import put
 
 __all__ = ["CellColumns", "aligned", "is_before", "parts_for"]
@@ -179,8 +179,11 @@ class CellColumns:
         self.ranges = wp.zeros(self.parts, dtype=wp.vec4i, device=DEFAULT_DEVICE)
         """Of each part its first cell, the one after its last, its first column, and the one after its last."""
         cells = buffer((3, capacity))
-        self._find_cells = self.packed(
-            _find_cells, [None, None, None, 0, radius], [cells, self.cell_of_point, self.point_count]
+        self._find_cells = PackedLaunch(
+            _find_cells,
+            min(self.parts, parts_for(capacity)),
+            [None, None, None, 0, radius],
+            [cells, self.cell_of_point, self.point_count],
         )
         words = bits_for(capacity, self.parts) + 1
         self.bits = [
@@ -206,7 +209,15 @@ class CellColumns:
         """Launches a kernel once per part."""
         launch_parts(kernel, self.parts, inputs, outputs)
 
-    def launch(self, xyz: wp.array, count: wp.array, include: wp.array, has_include: int) -> None:
-        """Fills everything."""
+    def launch(
+        self,
+        xyz: wp.array,
+        count: wp.array,
+        include: wp.array,
+        has_include: int,
+        then: PackedLaunch | None = None,
+    ) -> None:
+        """Fills everything; `then` is launched on it, each part where it was sorted."""
         self._find_cells.launch(xyz_in=xyz, count_in=count, include_in=include, has_include=has_include)
-        self._sort_cells.launch(xyz_in=xyz)
+        sort = self._sort_cells.calls(xyz_in=xyz)
+        run_in_turn(sort, then.calls() if then else [lambda: None] * len(sort))

@@ -23,6 +23,7 @@ from .cluster_labels import label_points
 from .cluster_levels import join_levels_in_order
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
+from .parts import parts_for
 from .plan import capacity_for, plan_for
 from .threads import PackedLaunch
 
@@ -33,6 +34,7 @@ wp.set_module_options({"fuse_fp": False})
 
 _SMALLEST_RADIUS = 1e-8
 _LEAST_GROWTH = 1e-5
+_LEAST_PART = 30_000  # points for which a thread of their own is worth its while
 
 
 @wp.kernel
@@ -142,7 +144,8 @@ class EuclideanCluster:
         forward = [d for d in np.ndindex(5, 5, 5) if d > (2, 2, 2)]
         offsets = np.array(sorted(forward, key=lambda d: sum((i - 2) ** 2 for i in d)), np.int32) - 2
         if sequential:
-            by_cell = CellColumns(self._radius, self.capacity, ordered=False)
+            parts = parts_for(self.capacity, _LEAST_PART)
+            by_cell = CellColumns(self._radius, self.capacity, parts, ordered=False)
             keep("_by_cell", by_cell)
             columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
             joined = JoinedColumns(by_cell, *columns, self._radius, by_cell.bits)
@@ -193,8 +196,8 @@ class EuclideanCluster:
 
     def _launch_in_order(self, given: list, labels: wp.array) -> None:
         by_cell, joined = self._by_cell, self._joined
-        by_cell.launch(*given)
-        joined.launch()
+        by_cell.launch(*given, then=joined.join)
+        joined.launch_borders()
         if self.radius_per_metre > 0:
             columns = [by_cell.ranges, by_cell.columns, by_cell.stacks, by_cell.points]
             wp.launch(

@@ -404,13 +404,18 @@ class JoinedColumns:
         given = [ranges, columns, stacks, points, radius]
         own = [buffer(), buffer(), buffer(), buffer(cells + _LANES)]
         lanes = [buffer((6, cells + _LANES), wp.float32), buffer((3, capacity + _LANES), wp.float32)]
-        self._join = by_cell.packed(join_own_columns, [*given, *bits], [*own, *lanes, self.parent])
+        self.join = by_cell.packed(join_own_columns, [*given, *bits], [*own, *lanes, self.parent])
+        """Joins the cells of each part; a part reads only what the sort of that part has written."""
         self._join_borders = None
         if by_cell.parts > 1:
             self._join_borders = PackedLaunch(join_borders, None, given, [self.parent])
 
     def launch(self) -> None:
         """Joins the cells."""
-        self._join.launch()
+        self.join.launch()
+        self.launch_borders()
+
+    def launch_borders(self) -> None:
+        """Joins the cells at the borders of the parts, after `join`."""
         if self._join_borders is not None:
             self._join_borders.launch()

@@ -20,7 +20,16 @@ import warp as wp
 
 from .device import DEFAULT_DEVICE
 
-__all__ = ["CREW", "PackedLaunch", "forks_taken_by", "launch_parts", "run_together", "set_thread_count", "thread_count"]
+__all__ = [
+    "CREW",
+    "PackedLaunch",
+    "forks_taken_by",
+    "launch_parts",
+    "run_in_turn",
+    "run_together",
+    "set_thread_count",
+    "thread_count",
+]
 
 CREW = "warploom-kernels-"
 """What the names of the threads begin with."""
@@ -163,6 +172,19 @@ def run_together(calls: Sequence[Callable[[], Any]]) -> None:
         raise failed
 
 
+def run_in_turn(*series: Sequence[Callable[[], Any]]) -> None:
+    """Runs the first calls of all series one after the other on one thread, at once the second ones on another thread.
+
+    And so on. For launches in parts of which none reads what another part has written: they wake the threads once.
+    """
+
+    def run(calls: Sequence[Callable[[], Any]]) -> None:
+        for call in calls:
+            call()
+
+    run_together([partial(run, calls) for calls in zip(*series, strict=True)])
+
+
 class PackedLaunch:
     """A kernel's launch on the CPU, whose parameters are packed once but for some that change.
 
@@ -192,6 +214,14 @@ class PackedLaunch:
         Args:
             **changed: Parameters by name, in place of what was last given.
         """
+        run_together(self.calls(**changed))
+
+    def calls(self, **changed: Any) -> Sequence[Callable[[], Any]]:
+        """A call for each part, which launches it; good until the parameters change again.
+
+        Args:
+            **changed: Parameters by name, in place of what was last given.
+        """
         if changed and not self._index:
             self._index = {argument.label: index for index, argument in enumerate(self._kernel.adj.args)}
         places = {self._index[name]: value for name, value in changed.items()}
@@ -200,8 +230,7 @@ class PackedLaunch:
             for index, value in places.items():
                 given[index - self._own] = value
             if self._device.is_capturing:
-                run_together([partial(self._launch, part, given) for part in range(self._parts or 1)])
-                return
+                return [partial(self._launch, part, given) for part in range(self._parts or 1)]
             self._record(given)
         else:
             first, *others = self._commands
@@ -209,10 +238,7 @@ class PackedLaunch:
                 first.set_param_at_index(index, value)
                 for other in others:  # the launch's bounds come before the parameters
                     other.params[index + 1] = first.params[index + 1]
-        if len(self._commands) == 1:
-            self._commands[0].launch()
-        else:
-            run_together([command.launch for command in self._commands])
+        return [command.launch for command in self._commands]
 
     def _launch(self, part: int, given: list[Any], **how: Any) -> Any:
         own = [] if self._parts is None else [part, self._parts]

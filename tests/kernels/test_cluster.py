@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from warploom.kernels import cell_columns
+from warploom.kernels import cluster as clustering
 from warploom.kernels.cluster import EuclideanCluster, cluster
 from warploom.kernels.interop import count_on
 
@@ -271,9 +272,15 @@ def clouds_of_all_kinds():
         yield name, points.astype(np.float32)
 
 
+def cut_into(parts, monkeypatch):
+    """Cuts the work of plans that are made from here on into so many parts."""
+    monkeypatch.setattr(clustering, "parts_for", lambda capacity, least: parts)
+    monkeypatch.setattr(cell_columns, "parts_for", lambda capacity: parts)
+
+
 @pytest.mark.parametrize("parts", [1, 2, 3, 7])
 def test_the_number_of_parts_does_not_change_the_labels(monkeypatch, parts):
-    monkeypatch.setattr(cell_columns, "parts_for", lambda capacity: parts)
+    cut_into(parts, monkeypatch)
     for name, points in clouds_of_all_kinds():
         expected = reference(points, 0.5, 2)
         np.testing.assert_array_equal(launched(points, radius=0.5, min_size=2), expected, err_msg=name)
@@ -292,7 +299,7 @@ def test_real_scans_are_clustered_alike_by_all_ways(shared_data, monkeypatch):
         points = np.ascontiguousarray(points, np.float32)
         expected = launched(points, radius=0.5, method="shared")
         for parts in (1, 3):
-            monkeypatch.setattr(cell_columns, "parts_for", lambda capacity, parts=parts: parts)
+            cut_into(parts, monkeypatch)
             np.testing.assert_array_equal(launched(points, radius=0.5), expected, err_msg=name)
 
 

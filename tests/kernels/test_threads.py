@@ -6,12 +6,20 @@ import os
 import subprocess
 import sys
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
 import warp as wp
 
-from warploom.kernels.threads import PackedLaunch, launch_parts, run_together, set_thread_count, thread_count
+from warploom.kernels.threads import (
+    PackedLaunch,
+    launch_parts,
+    run_in_turn,
+    run_together,
+    set_thread_count,
+    thread_count,
+)
 
 
 @wp.kernel
@@ -98,6 +106,22 @@ def test_calls_run_at_once():
     run_together([met.wait] * 3)
 
     assert not met.broken
+
+
+def test_series_run_side_by_side_each_in_its_order():
+    met, ran = threading.Barrier(2, timeout=10), {0: [], 1: []}
+
+    def call(part, name):
+        met.wait()
+        ran[part].append((name, threading.get_ident()))
+
+    run_in_turn(*([partial(call, part, name) for part in range(2)] for name in "abc"))
+
+    for part in range(2):
+        assert [name for name, _ in ran[part]] == ["a", "b", "c"]
+        assert len({thread for _, thread in ran[part]}) == 1
+    with pytest.raises(ValueError, match="zip"):
+        run_in_turn([lambda: None], [lambda: None] * 2)
 
 
 def test_an_error_is_handed_on_after_all_calls_have_ended():
