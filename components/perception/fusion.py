@@ -6,10 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from ...dag import In, Out, Processor, Trigger
 from ...datamesh import Status
+from ...models.association import assign
 from ...models.fusion import Fusion, FusionConfig
 from ..messages import CameraObjects, CameraSet, DetectedObjects, Obstacles, RadarObjects, RadarSet
 from .tracker_settings import TrackerSettings
@@ -71,6 +73,7 @@ class FusionProcessor(Processor):
         self._epoch: int | None = None
         self._ages: dict[str, float] = {}
         self._missing: tuple[str, ...] = fusion.sensors
+        assign(np.empty((0, 0)))  # loads SciPy now, half a second that the first frame would wait for
 
     def process(self, trigger: Trigger) -> Status:
         """Takes up the detections of one frame."""
