@@ -58,7 +58,7 @@ def eval_tracking(
         ),
     ] = None,
     sequences: Annotated[
-        str, typer.Option("--sequences", help="Such as 0001,0012; by default all with labels and detections.")
+        str, typer.Option("--sequences", help="Such as 0001,0012; by default all with labels and detections, or scans.")
     ] = "",
     out: Annotated[Path, typer.Option(help="Folder for result files, summary.json and plots over recall.")] = Path(
         "warploom-eval"
@@ -78,7 +78,9 @@ def eval_tracking(
     """Track objects and score the tracks: sAMOTA, MOTA, HOTA; on a drive of the simulator velocities and ids as well.
 
     Example: `warploom eval tracking --data kitti_tracking --detections pointrcnn_Car --out car`
+
     Example: `warploom eval tracking --data kitti_tracking --sequences 0000`
+
     Example: `warploom eval tracking --data "sim:occlusion?seeds=1-8&duration=7" --detections truth`
     """
     from ..components.evaluation import tracking, tracking_objects
@@ -93,9 +95,7 @@ def eval_tracking(
         )
         lines = tracking_objects.lines_of_drives(result)
     elif detections is None:
-        found = tracking_objects.evaluate_scans(
-            Path(data), names or ["0000"], out, profile=profile, settings=settings or ()
-        )
+        found = tracking_objects.evaluate_scans(Path(data), names, out, profile=profile, settings=settings or ())
         lines = [line for result in found for line in tracking.lines_of(result)]
     else:
         config = load_tracker(tracker, settings or ())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import json
@@ -17,11 +18,16 @@ import typer
 from .options import Settings
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from ..components.launching import Launch
 
 __all__ = ["commands"]
 
 commands = typer.Typer()
+
+_FIRST_PICTURE_S = 0.5
+"""After which `top` shows its first picture, of the CPU time since it was called [s]."""
 
 Node = Annotated[str | None, typer.Option("--node", help="Which node; by default the only one that runs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="As JSON.")]
@@ -188,7 +194,7 @@ def ps(node: Node = None, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps(status))
     else:
-        _print(process_table(status))
+        _print(process_table(status, width=_console().width))
         _print(component_table(status))
 
 
@@ -204,24 +210,27 @@ def top(
     Example: `warploom top --every 1`
     """
     from ..dag.launch.control import connect
-    from ..dag.launch.table import process_table
+    from ..dag.launch.table import usage_view
 
     _, client = connect(node)
     shown = 0
-    with client:
+    with client, contextlib.ExitStack() as stack:
+        show = _print
+        if sys.stdout.isatty() and not as_json:
+            from rich.live import Live
+
+            live = stack.enter_context(Live(auto_refresh=False))
+            show = functools.partial(live.update, refresh=True)
         before = client.ask("ps")
         while not count or shown < count:
-            time.sleep(every)
+            time.sleep(every if shown else min(every, _FIRST_PICTURE_S))
             status = client.ask("ps")
             cpu = _cpu_shares(before, status)
             before, shown = status, shown + 1
             if as_json:
                 typer.echo(json.dumps({**status, "cpu_percent": cpu}))
-                continue
-            if sys.stdout.isatty():
-                typer.clear()
-            _print(process_table(status, cpu))
-            typer.echo(f"supervisor: process {status['supervisor']['pid']}, {cpu[status['supervisor']['pid']]:.1f} %")
+            else:
+                show(usage_view(status, cpu, _console().width))
 
 
 def _cpu_shares(before: dict[str, Any], after: dict[str, Any]) -> dict[int, float]:
@@ -317,6 +326,11 @@ def _entries(topic: str, node: str | None, timeout: float | None, **how: bool) -
 
 
 def _print(table: Any) -> None:
+    _console().print(table)
+
+
+def _console() -> Console:
+    """The terminal, or room for the tables where what is printed goes elsewhere."""
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    return Console(width=None if sys.stdout.isatty() else 160)

@@ -3,6 +3,7 @@
 import json
 import os
 import pathlib
+import pty
 import subprocess
 import sys
 import tempfile
@@ -57,6 +58,23 @@ def test_every_command_has_help_with_an_example(warploom, command):
     assert f"warploom {command}" in warploom(command, "--help").split("Example")[1]
 
 
+def on_terminal(arguments):
+    """What a command shows on a terminal, in a process of its own."""
+    ours, theirs = pty.openpty()
+    code = f"import sys; from warploom.cli import main; sys.argv = ['warploom', *{arguments!r}]; main()"
+    command = subprocess.Popen([sys.executable, "-c", code], stdout=theirs, stderr=theirs, env=os.environ)
+    os.close(theirs)
+    shown = b""
+    try:
+        while data := os.read(ours, 1 << 16):
+            shown += data
+    except OSError:  # the end of a terminal
+        pass
+    os.close(ours)
+    assert command.wait(60) == 0, shown.decode()
+    return shown.decode()
+
+
 def test_a_running_node_answers_every_command(folder, warploom):
     paths = os.pathsep.join([str(PARTS), os.environ.get("PYTHONPATH", "")])
     # The reference's command line: one process, several modules.
@@ -80,6 +98,7 @@ def test_a_running_node_answers_every_command(folder, warploom):
         top = json.loads(warploom("top", "--every", 0.3, "--count", 1, "--json"))
         assert set(top["cpu_percent"]) == {str(status["processes"][0]["pid"]), str(status["supervisor"]["pid"])}
         assert "supervisor: process" in warploom("top", "--every", 0.1, "--count", 1)
+        assert "supervisor: process" in on_terminal(["top", "--every", "0.2", "--count", "2"])
         assert "compute3d_sched/doubler" in warploom("topics")
         topics = {topic["topic"]: topic for topic in json.loads(warploom("topics", "--json"))["topics"]}
         assert topics["ticks"]["readers"] == ["compute3d_sched/doubler"]

@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import json
 import os
+import select
 import socket
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
@@ -21,7 +22,7 @@ from typing import Any
 from ...errors import ConfigError, WarploomError
 from ..configuration import nearest
 from .channel import LINE_BYTES, pack_line
-from .run_folder import RunFolder, running_nodes
+from .run_folder import RunFolder, run_base, running_nodes
 
 __all__ = ["Answers", "ControlClient", "ControlServer", "connect"]
 
@@ -170,6 +171,15 @@ class ControlClient:
             raise WarploomError(f"the supervisor does not answer: {error}") from error
         raise WarploomError("the supervisor has ended")
 
+    @property
+    def ended(self) -> bool:
+        """Whether the supervisor has gone away."""
+        try:
+            readable, _, _ = select.select([self._socket], [], [], 0.0)
+            return bool(readable) and not self._socket.recv(1, socket.MSG_PEEK)
+        except OSError:
+            return True
+
     def close(self) -> None:
         """Ends the connection."""
         self._lines.close()
@@ -194,8 +204,12 @@ def connect(node: str | None = None) -> tuple[str, ControlClient]:
     running = running_nodes()
     if node is None:
         if len(running) != 1:
-            what = f"several nodes run: {', '.join(running)}; say which with --node" if running else "no node runs"
-            raise ConfigError(what)
+            if running:
+                raise ConfigError(f"several nodes run: {', '.join(running)}; say which with --node")
+            raise ConfigError(
+                f"no node runs: none is in {run_base()}, where $WARPLOOM_RUN or $XDG_RUNTIME_DIR says; "
+                "`warploom launch` starts one"
+            )
         node = running[0]
     elif node not in running:
         raise ConfigError(f"node {node!r} does not run; {nearest(node, running)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
+import math
 import queue
 import time
 from collections import deque
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...datamesh import DataMesh, Entry
+from ...errors import WarploomError
 from .control import ControlClient
 
 __all__ = ["RateMeter", "listen", "plain_value"]
@@ -21,6 +23,8 @@ __all__ = ["RateMeter", "listen", "plain_value"]
 _SHOWN_ITEMS = 16
 _SHOWN_TEXT = 400
 _DEPTH = 6
+_LOOK_S = 0.5
+"""How often is looked whether the node is still there, while nothing comes [s]."""
 
 
 def _register_message(client: ControlClient, topic: str) -> None:
@@ -53,7 +57,7 @@ def listen(
         ends: Whether it ends when none comes in time; otherwise it gives None and goes on.
 
     Raises:
-        WarploomError: Nobody commits the topic.
+        WarploomError: Nobody commits the topic, or the node has ended.
         TimeoutError: Nothing came in time.
     """
     from .linking import LinkPlan, Links
@@ -67,17 +71,26 @@ def listen(
     mesh.window(topic).subscribe(arrived.put, lambda version, epoch: None)
     links = Links(mesh, LinkPlan((), (topic,)), node=node, name=name)
     links.start()
+    due = None
     try:
         while True:
+            if due is None:
+                due = math.inf if timeout_s is None else time.monotonic() + timeout_s
             try:
-                entry = arrived.get(timeout=timeout_s)
-                if past or entry.committed_ns >= began:
-                    yield entry
+                entry = arrived.get(timeout=max(0.0, min(_LOOK_S, due - time.monotonic())))
             except queue.Empty:
-                if not ends:
-                    yield None
+                if client.ended:
+                    raise WarploomError(f"node {node!r} has ended") from None
+                if time.monotonic() < due:
                     continue
-                raise TimeoutError(f"nothing was committed to {topic!r} for {timeout_s:g} s") from None
+                if ends:
+                    raise TimeoutError(f"nothing was committed to {topic!r} for {timeout_s:g} s") from None
+                due = None
+                yield None
+                continue
+            due = None
+            if past or entry.committed_ns >= began:
+                yield entry
     finally:
         links.stop()
 

@@ -9,13 +9,17 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, Group
     from rich.table import Table
 
-__all__ = ["JsonLines", "LiveTable", "component_table", "process_table", "topic_table"]
+__all__ = ["JsonLines", "LiveTable", "component_table", "process_table", "topic_table", "usage_view"]
 
 _SHOWN_EVENTS = 8
 _QUIET = ("state",)
+_COLUMNS = ("process", "state", "pid", "up", "restarts", "cpu %", "memory", "fds")
+_LEFT_OUT_FIRST = ("fds", "memory", "up", "restarts", "pid")
+_SAYS_WIDTH = 24
+"""Characters that the last column of the processes is to have."""
 
 
 class JsonLines:
@@ -73,7 +77,8 @@ class LiveTable:
         from rich.text import Text
 
         lines = [Text(event_text(event), style=_style(event)) for event in self._events]
-        self._live.update(Group(process_table(self._status()), *lines), refresh=True)
+        table = process_table(self._status(), width=self._live.console.width)
+        self._live.update(Group(table, *lines), refresh=True)
 
 
 def event_text(event: Mapping[str, Any]) -> str:
@@ -97,42 +102,63 @@ def _style(event: Mapping[str, Any]) -> str:
     }.get(event["event"], "")
 
 
-def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None) -> Table:
+def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = None, width: int | None = None) -> Table:
     """The processes of a node.
 
     Args:
         status: As `ps` is answered.
         cpu: Share of a core by process id, where it was measured [%].
+        width: Of the terminal, in characters: on a narrow one columns are left out; None: it has room for all.
     """
     from rich.table import Table
 
+    rows = [_process_row(process, cpu) for process in status["processes"]]
+    names = [name for name in _COLUMNS if name != "cpu %" or cpu is not None]
+    widths = {name: 3 + max(len(name), *(len(row[name]) for row in rows)) for name in names}
+    for name in _LEFT_OUT_FIRST:
+        if width is None or sum(widths[one] for one in names) + _SAYS_WIDTH <= width:
+            break
+        names.remove(name)
     table = Table(title=f"node {status['node']}", title_justify="left")
-    for name in ("process", "state", "pid", "up", "restarts", *(["cpu %"] if cpu is not None else []), "memory", "fds"):
+    for name in names:
         table.add_column(name, justify="left" if name in ("process", "state") else "right", no_wrap=True)
     table.add_column("says", overflow="fold")
-    for process in status["processes"]:
-        idle, starting = (
-            sum(bool(component.get(why)) for component in process["components"])
-            for why in ("idle_because", "starting_because")
-        )
-        says = [f"{len(process['components'])} components" + (f", {idle} of them idle" if idle else "")]
-        says += [f"{starting} of them not ready to serve yet"] if starting else []
-        says += process["warnings"]
-        if process["last_death"]:
-            says.append(f"last death: {process['last_death']}")
-        table.add_row(
-            process["name"],
-            process["state"],
-            str(process["pid"] or "-"),
-            duration_text(process["uptime_s"]),
-            str(process["restarts"]),
-            *([f"{cpu.get(process['pid'], 0.0):.1f}"] if cpu is not None else []),
-            f"{process['rss'] / 2**20:.0f} MiB" if "rss" in process else "-",
-            str(process.get("fds", "-")),
-            "\n".join(says),
-            style="" if process["state"] == "running" else "yellow",
-        )
+    for process, row in zip(status["processes"], rows, strict=True):
+        style = "" if process["state"] == "running" else "yellow"
+        table.add_row(*(row[name] for name in names), row["says"], style=style)
     return table
+
+
+def _process_row(process: Mapping[str, Any], cpu: Mapping[int, float] | None) -> dict[str, str]:
+    idle, starting = (
+        sum(bool(component.get(why)) for component in process["components"])
+        for why in ("idle_because", "starting_because")
+    )
+    says = [f"{len(process['components'])} components" + (f", {idle} of them idle" if idle else "")]
+    says += [f"{starting} of them not ready to serve yet"] if starting else []
+    says += process["warnings"]
+    if process["last_death"]:
+        says.append(f"last death: {process['last_death']}")
+    return {
+        "process": process["name"],
+        "state": process["state"],
+        "pid": str(process["pid"] or "-"),
+        "up": duration_text(process["uptime_s"]),
+        "restarts": str(process["restarts"]),
+        "cpu %": "-" if cpu is None else f"{cpu.get(process['pid'], 0.0):.1f}",
+        "memory": f"{process['rss'] / 2**20:.0f} MiB" if "rss" in process else "-",
+        "fds": str(process.get("fds", "-")),
+        "says": "\n".join(says),
+    }
+
+
+def usage_view(status: Mapping[str, Any], cpu: Mapping[int, float], width: int | None = None) -> Group:
+    """The processes of a node and its supervisor, with the share of a core that each uses, as `process_table`."""
+    from rich.console import Group
+    from rich.text import Text
+
+    pid = status["supervisor"]["pid"]
+    return Group(process_table(status, cpu, width), Text(f"supervisor: process {pid}, {cpu.get(pid, 0.0):.1f} %"))
 
 
 def component_table(status: Mapping[str, Any]) -> Table:

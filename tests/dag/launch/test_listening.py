@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from warploom.dag.launch.listening import RateMeter, plain_value
+from warploom.dag.launch.listening import RateMeter, listen, plain_value
+from warploom.errors import WarploomError
 
 
 @dataclass
@@ -30,6 +31,21 @@ def test_values_are_shown_plainly_and_briefly():
     assert plain_value(list(range(30)))[-1] == "… 30 in all"
     assert plain_value({n: n for n in range(30)})["…"] == "30 in all"
     assert plain_value("x" * 1000).endswith("… (1000 characters)")
+
+
+class Supervisor:
+    """As much of one as a listener asks."""
+
+    ended = False
+
+    def ask(self, request, **arguments):
+        self.ended = request == "export"  # gone right afterwards
+        return {"topics": []}
+
+
+def test_who_listens_is_told_that_the_node_has_ended(run_base):
+    with pytest.raises(WarploomError, match="node 'gone' has ended"):
+        next(listen(Supervisor(), "gone", "ticks", "listener"))
 
 
 def test_what_holds_itself_is_shown_to_a_depth():

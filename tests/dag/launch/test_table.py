@@ -14,6 +14,7 @@ from warploom.dag.launch.table import (
     event_text,
     process_table,
     topic_table,
+    usage_view,
 )
 
 STATUS = {
@@ -75,6 +76,18 @@ def test_processes_are_shown_with_what_they_say():
     assert "last death: was ended by SIGKILL" in shown
     assert "1 of them not ready to serve yet" in shown
     assert "back off" in shown
+
+
+@pytest.mark.parametrize("width", [56, 80, 200])
+def test_a_narrow_terminal_shows_fewer_columns_and_none_of_them_cut(width):
+    out = io.StringIO()
+    Console(file=out, width=width).print(usage_view({**STATUS, "supervisor": {"pid": 7}}, {41: 12.34}, width))
+    shown = out.getvalue()
+    assert max(map(len, shown.splitlines())) <= width
+    assert "…" not in shown
+    for expected in ("compute", "running", "12.3", "3 components", "supervisor: process 7, 0.0 %"):
+        assert expected in shown
+    assert ("3 MiB" in shown) == (width == 200)
 
 
 def test_components_say_why_they_are_idle_or_what_they_do():
