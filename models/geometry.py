@@ -289,9 +289,10 @@ class KittiCalibration:
 def _read_kitti_keys(path: Path) -> dict[str, np.ndarray]:
     """The lines `name: numbers` (in the tracking set some lack the colon) of a calibration file."""
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: cannot read the calibration: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SourceError(f"{path}: cannot read the calibration: {reason or error}") from error
     values = {}
     for number, line in enumerate(lines, 1):
         name, *numbers = line.split() or [""]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +14,7 @@ from ...errors import SourceError
 from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ...models.evaluation.kitti_ap import KittiDetections, KittiTruth
 from ...models.geometry import KittiCalibration, box_corners, points_in_boxes
+from ..sources.kitti_labels import KITTI_CLASSES
 
 __all__ = [
     "KITTI_CLASS_OF_TYPE",
@@ -19,6 +22,8 @@ __all__ = [
     "KittiLabels",
     "kitti_detections",
     "label_files",
+    "label_rows",
+    "labelled_sequences",
     "read_results",
     "unpack_scan",
 ]
@@ -28,8 +33,12 @@ KITTI_CLASS_OF_TYPE = {"Car": VEHICLE, "Pedestrian": PEDESTRIAN, "Cyclist": CYCL
 
 KITTI_TYPE_OF_CLASS = {index: name for name, index in KITTI_CLASS_OF_TYPE.items()}
 
+_log = logging.getLogger(__name__)
+
 _IMAGE = (1242.0, 375.0)  # pixels
 _CAMERA = 2
+_TYPES = (*KITTI_CLASSES, "DontCare")
+_COLUMNS = "trunc occ alpha x1 y1 x2 y2 h w l x y z ry"
 _NEAREST = 0.1  # metres before the camera's plane, where what lies behind is cut
 # The edges of a box, as pairs of the corners that `box_corners` gives.
 _EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
@@ -144,11 +153,14 @@ def unpack_scan(path: pathlib.Path) -> np.ndarray:
     return np.column_stack([xyz, intensity])
 
 
+LabelRow = tuple[tuple[int, ...], str, list[float]]
 LabelledScan = tuple[pathlib.Path, Callable[[], KittiLabels], pathlib.Path | None]
 
 
 def label_files(root: pathlib.Path, sequence: str | None = None) -> list[LabelledScan]:
     """The scans of a folder that have labels: path, a function that reads the labels, and the image where there is one.
+
+    Of an object set, scans without labels and labels without a scan are left out, and the log says how many.
 
     Raises:
         SourceError: There are none, or a sequence must be named.
@@ -163,9 +175,15 @@ def label_files(root: pathlib.Path, sequence: str | None = None) -> list[Labelle
         ]
         if not found:
             raise SourceError(f"{root}: no scan in velodyne/ has labels in label_2/")
+        labelled, scanned = {path.stem for path in (root / "label_2").glob("*.txt")}, {path.stem for path in scans}
+        for names, what in (
+            (scanned - labelled, "scans without labels"),
+            (labelled - scanned, "labels without a scan"),
+        ):
+            if names:
+                _log.warning("%s: %d %s are left out, such as %s", root, len(names), what, min(names))
         return found
-    labels = root / "label_02"
-    names = sorted(path.stem for path in labels.glob("*.txt") if _scans(root, path.stem)) if labels.is_dir() else []
+    names = labelled_sequences(root)
     if sequence is None and len(names) == 1:
         sequence = names[0]
     if sequence not in names:
@@ -175,11 +193,16 @@ def label_files(root: pathlib.Path, sequence: str | None = None) -> list[Labelle
     return [
         (
             path,
-            _reader(labels / f"{sequence}.txt", calibration, int(path.stem)),
+            _reader(root / "label_02" / f"{sequence}.txt", calibration, int(path.stem)),
             _existing(root / "image_02" / sequence / f"{path.stem}.png"),
         )
         for path in _scans(root, sequence)
     ]
+
+
+def labelled_sequences(root: pathlib.Path) -> list[str]:
+    """The sequences of a tracking set that have both labels and scans, in order."""
+    return sorted(path.stem for path in (root / "label_02").glob("*.txt") if _scans(root, path.stem))
 
 
 def _scans(root: pathlib.Path, below: str = "") -> list[pathlib.Path]:
@@ -196,27 +219,60 @@ def _reader(labels: pathlib.Path, calibration: pathlib.Path, frame: int | None) 
     return lambda: _read(labels, calibration, frame)
 
 
-def _rows(path: pathlib.Path, skip: int) -> list[list[str]]:
+def label_rows(path: pathlib.Path, *, leading: int = 0, score: bool = False) -> list[LabelRow]:
+    """The rows of a file of labels or results.
+
+    Args:
+        path: The file.
+        leading: How many whole numbers stand before the type: frame and track id of the tracking set.
+        score: Whether each row ends with a score, as results do.
+
+    Returns:
+        Of each row the leading numbers, the type, and trunc occ alpha, image box (4), h w l x y z ry, with the score.
+
+    Raises:
+        SourceError: It cannot be read, or a row is none of KITTI's.
+    """
     try:
-        rows = [line.split() for line in path.read_text("utf-8").splitlines() if line.strip()]
+        lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: cannot read the labels: {error}") from None
-    short = next((number for number, row in enumerate(rows, 1) if len(row) < skip + 15), None)
-    if short is not None:
-        raise SourceError(f"{path}, line {short}: not a KITTI label: {' '.join(rows[short - 1])[:60]!r}")
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SourceError(f"{path}: cannot read the labels: {reason or error}") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        words = line.split()
+        if not words:
+            continue
+        row = _parsed(words, leading, 15 if score else 14)
+        if row is None:
+            form = f"{'frame track ' * (leading > 0)}type {_COLUMNS}{' score' * score}"
+            raise SourceError(
+                f"{path}, line {number}: not a KITTI label: {line[:60]!r}; expected {form}, with a type of "
+                f"{', '.join(_TYPES)}"
+            )
+        rows.append(row)
     return rows
 
 
-def _read(path: pathlib.Path, calibration: pathlib.Path, frame: int | None) -> KittiLabels:
-    skip = 0 if frame is None else 2
-    rows = _rows(path, skip)
+def _parsed(words: list[str], leading: int, count: int) -> LabelRow | None:
     try:
-        chosen = [row[skip:] for row in rows if frame is None or int(row[0]) == frame]
-        numbers = np.array([[float(value) for value in row[1:15]] for row in chosen], np.float64).reshape(-1, 14)
-    except ValueError as error:
-        raise SourceError(f"{path}: not KITTI labels: {error}") from None
+        first = tuple(int(word) for word in words[:leading])
+        kind, numbers = words[leading], [float(word) for word in words[leading + 1 : leading + 1 + count]]
+    except (ValueError, IndexError):
+        return None
+    return (
+        (first, kind, numbers)
+        if kind in _TYPES and len(numbers) == count and all(map(math.isfinite, numbers))
+        else None
+    )
+
+
+def _read(path: pathlib.Path, calibration: pathlib.Path, frame: int | None) -> KittiLabels:
+    rows = label_rows(path, leading=0 if frame is None else 2)
+    chosen = [(kind, numbers) for first, kind, numbers in rows if frame is None or first[0] == frame]
+    numbers = np.array([numbers for _, numbers in chosen], np.float64).reshape(-1, 14)
     return KittiLabels(
-        types=tuple(row[0] for row in chosen),
+        types=tuple(kind for kind, _ in chosen),
         truncation=numbers[:, 0],
         occlusion=numbers[:, 1],
         image_boxes=numbers[:, 3:7],
@@ -231,9 +287,6 @@ def read_results(path: pathlib.Path, calibration: KittiCalibration) -> tuple[np.
     Raises:
         SourceError: It cannot be read, or a row has no score.
     """
-    rows = _rows(path, 1)
-    try:
-        numbers = np.array([[float(value) for value in row[1:16]] for row in rows], np.float64).reshape(-1, 15)
-    except ValueError as error:
-        raise SourceError(f"{path}: not KITTI results: {error}") from None
-    return calibration.boxes_from_camera(numbers[:, 7:14]), numbers[:, 14], tuple(row[0] for row in rows)
+    rows = label_rows(path, score=True)
+    numbers = np.array([numbers for _, _, numbers in rows], np.float64).reshape(-1, 15)
+    return calibration.boxes_from_camera(numbers[:, 7:14]), numbers[:, 14], tuple(kind for _, kind, _ in rows)

@@ -16,6 +16,7 @@ from ...errors import SourceError
 from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ...models.evaluation.tracking import TrackTable
 from ...models.geometry import KittiCalibration, box_corners, invert, kitti_poses, transform_boxes
+from .kitti_objects import label_rows
 
 __all__ = ["TYPES", "ObjectType", "TrackingSequence", "detection_format", "sequence_names", "write_results"]
 
@@ -49,14 +50,27 @@ TYPES = (
 """The types that KITTI evaluates."""
 
 
-def _numbers(path: pathlib.Path, delimiter: str | None = None) -> np.ndarray:
+def _numbers(path: pathlib.Path, delimiter: str | None = None, columns: int | None = None) -> np.ndarray:
+    """The rows of a file, all with as many numbers: `columns`, or those of the first."""
     try:
-        text = path.read_text()
-        return np.array([[float(v) for v in line.split(delimiter)] for line in text.splitlines() if line.strip()])
+        lines = path.read_text("utf-8").splitlines()
     except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}; expected rows of as many numbers each") from error
+        raise SourceError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path}: not a text: {error}") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(word) for word in line.split(delimiter)]
+        except ValueError as error:
+            raise SourceError(f"{path}, line {number}: {error}; expected rows of numbers") from error
+        columns = columns or len(row)
+        if len(row) != columns or not np.isfinite(row).all():
+            raise SourceError(f"{path}, line {number}: expected {columns} numbers, found {line[:60]!r}")
+        rows.append(row)
+    return np.array(rows).reshape(len(rows), columns or 0)
 
 
 def sequence_names(data: pathlib.Path, detections: pathlib.Path) -> list[str]:
@@ -79,9 +93,11 @@ def detection_format(detections: pathlib.Path, names: list[str]) -> tuple[Object
     They are where any score of any sequence lies outside [0, 1].
 
     Raises:
-        SourceError: They are of none that KITTI evaluates, or of several.
+        SourceError: There are none, or they are of none that KITTI evaluates, or of several.
     """
-    tables = [rows for name in names if (rows := _numbers(detections / f"{name}.txt", ",")).size]
+    tables = [rows for name in names if (rows := _read_detections(detections, name)).size]
+    if not tables:
+        raise SourceError(f"{detections}: no detection in {', '.join(f'{name}.txt' for name in names)}")
     numbers = {int(number) for rows in tables for number in np.unique(rows[:, 1])}
     found = [kind for kind in TYPES if kind.number in numbers]
     if len(numbers) != 1 or not found:
@@ -133,18 +149,23 @@ class TrackingSequence:
         """
         calibration = KittiCalibration.read(data / "calib" / f"{name}.txt")
         labels, dont_care = _read_labels(data / "label_02" / f"{name}.txt", kind)
-        rows = np.empty(0) if detections is None else _numbers(detections / f"{name}.txt", ",")
-        found = rows.reshape(-1, _DETECTION_COLUMNS)
+        found = np.empty((0, _DETECTION_COLUMNS)) if detections is None else _read_detections(detections, name)
         found = found[found[:, 1] == kind.number]
         oxts = data / "oxts" / f"{name}.txt"
         poses, first = None, 0
         # The last frame may hold no object of the type: areas without labels, which most frames have, tell it too.
-        count = int(max(labels[:, 0].max(initial=-1), found[:, 0].max(initial=-1), *dont_care, -1)) + 1
+        named = np.concatenate([labels[:, 0], found[:, 0], list(dont_care)]).astype(int)
+        count = int(named.max(initial=-1)) + 1
         if oxts.exists():
             records = _numbers(oxts)
             # A part of a sequence has its records alone, the last of which is of the last frame.
             first = max(count - len(records), 0)
             count = first + len(records)
+            if named.min(initial=first) < first:
+                raise SourceError(
+                    f"{oxts}: {len(records)} records, which are of the frames {first} to {count - 1} if the last is of "
+                    f"the last frame; but labels or detections begin at frame {named.min()}"
+                )
             poses = kitti_poses(records, calibration.lidar_from_imu)
             poses = poses @ invert(calibration.rectified_from_lidar) @ _AXES.T
         frames = np.arange(first, count)
@@ -212,23 +233,21 @@ def _camera_boxes(boxes: np.ndarray) -> np.ndarray:
     return np.stack([h, w, length, -y, 0.5 * h - z, x, ry], axis=1)
 
 
+def _read_detections(folder: pathlib.Path, name: str) -> np.ndarray:
+    """Rows of frame, type, image box (4), score, h w l x y z ry, alpha; shape (n, 15)."""
+    return _numbers(folder / f"{name}.txt", ",", _DETECTION_COLUMNS)
+
+
 def _read_labels(path: pathlib.Path, kind: ObjectType) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """Rows of frame, id, ignored, h w l x y z ry, by frame; and the areas without labels."""
     rows: list[list[float]] = []
     areas: dict[int, list[list[float]]] = {}
-    try:
-        for line in path.read_text().splitlines():
-            field = line.split()
-            if field[2] == "DontCare":
-                areas.setdefault(int(field[0]), []).append([float(v) for v in field[6:10]])
-            elif field[2] == kind.name or field[2] in kind.neighbours:
-                cut_off, hidden = float(field[3]) > _MOST_TRUNCATION, int(field[4]) > _MOST_OCCLUSION
-                ignored = field[2] != kind.name or hidden or cut_off
-                rows.append([float(field[0]), float(field[1]), ignored, *(float(v) for v in field[10:17])])
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}") from error
-    except (IndexError, ValueError) as error:
-        raise SourceError(f"{path}: not a label file of KITTI's tracking set: {error}") from error
+    for (frame, track), name, numbers in label_rows(path, leading=2):
+        if name == "DontCare":
+            areas.setdefault(frame, []).append(numbers[3:7])
+        elif name == kind.name or name in kind.neighbours:
+            cut_off, hidden = numbers[0] > _MOST_TRUNCATION, numbers[1] > _MOST_OCCLUSION
+            rows.append([frame, track, name != kind.name or hidden or cut_off, *numbers[7:14]])
     table = np.array(rows).reshape(-1, 10)
     table = table[np.argsort(table[:, 0], kind="stable")]
     return table, {frame: np.array(each) for frame, each in areas.items()}

@@ -213,6 +213,8 @@ def evaluate_tracking(
     names = list(sequences) or known
     kind, logits = detection_format(folder, names)
     read = [TrackingSequence.read(data, folder, name, kind, logits=logits) for name in names]
+    if all(sequence.truth.ignored is None or sequence.truth.ignored.all() for sequence in read):
+        raise SourceError(f"{data / 'label_02'}: no {kind.name} that counts is labelled in {', '.join(names)}")
 
     out.mkdir(parents=True, exist_ok=True)
     tables, seconds, dropped = [], 0.0, Counter()

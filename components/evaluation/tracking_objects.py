@@ -27,7 +27,7 @@ from ...models.tracker import Tracker, TrackerConfig
 from ..messages import DetectedObjects, Obstacles, SensorFrame
 from ..perception.tracker_settings import TrackerSettings
 from ..pipeline import Pipeline
-from .kitti_objects import label_files, unpack_scan
+from .kitti_objects import label_files, labelled_sequences, unpack_scan
 from .kitti_tracking import TYPES, ObjectType, TrackingSequence, write_results
 from .tracking import TrackingEvaluation, score_tracks, write_summary
 
@@ -347,7 +347,7 @@ def evaluate_scans(
 
     Args:
         data: With `velodyne/` or `velodyne_packed/`, `label_02/`, `calib/` and, for the ego's poses, `oxts/`.
-        names: Of the sequences.
+        names: Of the sequences; none are all that have labels and scans.
         out: Folder for what is written.
         profile: A hardware profile.
         settings: Changes to it, as texts `key=value`.
@@ -356,6 +356,11 @@ def evaluate_scans(
         SourceError: Data are missing or damaged.
         ConfigError: Profile or settings are bad.
     """
+    if not data.is_dir():
+        raise SourceError(f"{data}: no such folder; expected KITTI's tracking set with label_02/, calib/ and velodyne/")
+    names = names or labelled_sequences(data)
+    if not names:
+        raise SourceError(f"{data}: no sequence of label_02/ has scans in velodyne/ or velodyne_packed/")
     read = {name: {kind: TrackingSequence.read(data, None, name, kind) for kind in TYPES} for name in names}
     found: dict[str, list[tuple[int, Obstacles]]] = {}
     dropped: Counter[str] = Counter()

@@ -196,7 +196,7 @@ def _choose(root: pathlib.Path, there: list[str], sequence: str | None) -> str:
         return sequence
     if sequence is None and len(there) == 1:
         return there[0]
-    problem = "which sequence?" if sequence is None else f"no sequence {sequence!r}"
+    problem = "which sequence?" if sequence is None else f"no sequence {sequence!r} with scans."
     listed = ", ".join(there[:20]) + (" …" if len(there) > 20 else "")
     raise SourceError(f"{root}: {problem} There are: {listed or 'none'}; write kitti:DIR?sequence=NAME")
 
@@ -210,10 +210,24 @@ def _number(path: pathlib.Path) -> int:
 def _numbers(path: pathlib.Path, columns: int) -> np.ndarray:
     """A text file of numbers, at least so many a line."""
     try:
-        rows = [[float(word) for word in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: cannot be read as rows of numbers: {error}") from None
-    if not rows or len({len(row) for row in rows}) > 1 or len(rows[0]) < columns or not np.isfinite(rows).all():
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SourceError(f"{path}: cannot be read as rows of numbers: {reason or error}") from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError as error:
+            raise SourceError(f"{path}, line {number}: cannot be read as rows of numbers: {error}") from None
+        if len(row) != len((rows or [row])[0]) or len(row) < columns or not np.isfinite(row).all():
+            raise SourceError(
+                f"{path}, line {number}: damaged: expected lines of the same {columns} or more finite numbers"
+            )
+        rows.append(row)
+    if not rows:
         raise SourceError(f"{path}: damaged: expected lines of the same {columns} or more finite numbers")
     return np.array(rows)
 
@@ -224,7 +238,8 @@ def _keyed(path: pathlib.Path, keys: dict[str, int]) -> list[np.ndarray]:
         lines = [line.partition(":") for line in path.read_text("utf-8").splitlines()]
         found = {key.strip(): np.array(text.split(), np.float64) for key, _, text in lines if key.strip() in keys}
     except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: cannot read the calibration: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SourceError(f"{path}: cannot read the calibration: {reason or error}") from None
     for key, count in keys.items():
         if key not in found or len(found[key]) != count:
             raise SourceError(f"{path}: no line '{key}:' of {count} numbers")

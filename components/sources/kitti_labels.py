@@ -77,7 +77,8 @@ def read_labels(path: pathlib.Path, *, tracking: bool) -> dict[int, KittiLabels]
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: cannot read the labels: {error}") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SourceError(f"{path}: cannot read the labels: {reason or error}") from None
     rows: dict[int, list[tuple[int, int, list[float]]]] = {}
     for number, line in enumerate(lines, 1):
         words = line.split()

@@ -110,7 +110,9 @@ def test_damaged_data_are_named(kitti):
     whole = labels.read_text()
     for text, message in (
         ("Car 1 2\n", "line 1: not a KITTI label"),
-        (whole.replace("2.00 1.65", "x 1.65"), "not KITTI"),
+        (whole.replace("2.00 1.65", "x 1.65"), r"line \d: not a KITTI label"),
+        (whole.replace("2.00 1.65", "nan 1.65"), r"line \d: not a KITTI label"),
+        (whole.replace("Car", "car"), r"line \d: not a KITTI label.*with a type of Car, Van"),
     ):
         labels.write_text(text)
         with pytest.raises(SourceError, match=message):
@@ -121,6 +123,15 @@ def test_damaged_data_are_named(kitti):
     labels.write_text(whole)
     with pytest.raises(SourceError, match="cannot read the labels"):
         read_results(kitti / "none.txt", label_files(kitti)[0][1]().calibration)
+
+
+def test_what_has_no_counterpart_is_told(kitti, caplog):
+    (kitti / "velodyne" / "scan_2.bin").write_bytes((kitti / "velodyne" / "000001.bin").read_bytes())
+    for name in ("000002.txt", "000003.txt"):
+        (kitti / "label_2" / name).write_text("")
+    assert [frame.name for frame in evaluation_frames(f"kitti:{kitti}")] == ["set/000001"]
+    assert "1 scans without labels are left out, such as scan_2" in caplog.text
+    assert "2 labels without a scan are left out, such as 000002" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -113,21 +113,56 @@ def test_the_score_of_a_track_is_the_mean_of_its_rows_to_the_bit():
     assert few < many
 
 
+def damage_label(folder, line):
+    """Puts a line in the place of the fifth."""
+    path = folder / "label_02" / "0007.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:4], line, *lines[5:]]))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda d: shutil.rmtree(d / "found_Car"), r"found_Car: no such folder, nor in .*, which has: calib, label_02"),
         (lambda d: (d / "label_02" / "0007.txt").unlink(), "no sequence that .*label_02 has labels of"),
-        (lambda d: (d / "found_Car" / "0007.txt").write_text("0,9,1"), r"types \[9\] in the second column"),
-        (lambda d: (d / "found_Car" / "0007.txt").write_text("0,2,x"), "could not convert string to float: 'x'"),
-        (lambda d: (d / "label_02" / "0007.txt").write_text("0 1 Car"), "not a label file of KITTI's tracking set"),
-        (lambda d: (d / "calib" / "0007.txt").unlink(), "0007.txt"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_text("0,9" + 13 * ",1"), r"types \[9\] in the second column"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_text("\n0,2,x"), "line 2: could not convert string to .*'x'"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_text("0,2,1"), "line 1: expected 15 numbers, found '0,2,1'"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_text("0,nan" + 13 * ",1"), "line 1: expected 15 numbers"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_text("\n"), "no detection in 0007.txt"),
+        (lambda d: (d / "found_Car" / "0007.txt").write_bytes(b"\xff"), "found_Car.0007.txt: not a text"),
+        (lambda d: damage_label(d, "0 1 Car"), "line 5: not a KITTI label: '0 1 Car'; expected frame track type"),
+        (lambda d: damage_label(d, "1 2 3"), "line 5: not a KITTI label"),
+        (lambda d: damage_label(d, label(1, 1, "Car", "far")), "line 5: not a KITTI label"),
+        (lambda d: damage_label(d, label(1, 1, "Car", "inf")), "line 5: not a KITTI label"),
+        (lambda d: damage_label(d, label(1, 1, "car", 12)), "line 5: not a KITTI label.* with a type of Car, Van"),
+        (lambda d: (d / "label_02" / "0007.txt").write_text(label(0, 3, "Van", 25)), "no Car that counts .* in 0007$"),
+        (lambda d: (d / "calib" / "0007.txt").unlink(), "0007.txt: cannot read the .*: No such file or directory$"),
     ],
 )  # fmt: skip
 def test_what_is_missing_or_damaged_is_said(data, change, message):
     change(data)
     with pytest.raises(SourceError, match=message):
         evaluate_tracking(data, data / "found_Car", data / "out")
+
+
+@pytest.mark.parametrize(("records", "first"), [(30, 0), (40, 0), (19, 11)])
+def test_records_of_poses_that_begin_after_the_labels_are_refused(data, records, first):
+    """Frames without a record would else be left out, and the score be of the others alone."""
+    (data / "oxts").mkdir()
+    (data / "oxts" / "0007.txt").write_text(f"49.0 8.4 100 {' 0' * 27}\n" * records)
+    if first:
+        with pytest.raises(SourceError, match=f"19 records, which are of the frames {first} to 29 .* begin at frame 0"):
+            TrackingSequence.read(data, data / "found_Car", "0007", CAR)
+    else:
+        assert len(TrackingSequence.read(data, data / "found_Car", "0007", CAR).frames) == records
+
+
+def test_a_damaged_record_of_poses_is_named_by_its_line(data):
+    (data / "oxts").mkdir()
+    (data / "oxts" / "0007.txt").write_text(f"49.0 8.4 100 {' 0' * 27}\n" * 29 + "1 2 3\n")
+    with pytest.raises(SourceError, match=r"oxts.0007.txt, line 30: expected 30 numbers, found '1 2 3'"):
+        TrackingSequence.read(data, data / "found_Car", "0007", CAR)
 
 
 def test_a_sequence_that_is_not_there_is_named(data):
