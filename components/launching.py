@@ -264,7 +264,8 @@ def _build_child(told: Mapping[str, Any]) -> tuple[Process, ProcessLinks, Sequen
     from ..datamesh.transport import SharedMemoryConfig, ZenohConfig
 
     links = told["links"]
-    plan = LinkPlan(*(tuple(links[key]) for key in ("exports", "imports", "blocking")), links["remote"])
+    topics = {key: tuple(links[key]) for key in ("exports", "imports", "blocking", "homes")}
+    plan = LinkPlan(**topics, remote=links["remote"])
     connected = Links(
         process,
         plan,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from ...datamesh import DataMesh, Input, Output, declared_handles
+from ...datamesh.messages import message_type
 from ...datamesh.transport import Exporter, ExportService, Importer, SharedMemoryConfig, ZenohConfig
 from ...datamesh.transport.zenoh_links import ZenohExporter, ZenohImporter, ZenohSession
 from ...errors import ConfigError
@@ -36,6 +38,9 @@ class LinkPlan:
     """Of the imports, those whose producer waits where this process is not ready for more: backlog `block`."""
     remote: Mapping[str, str] = field(default_factory=dict)
     """Of both, those that go between hosts, and how."""
+    homes: tuple[str, ...] = ()
+    """Python modules that define the messages of the imports: a process that names none of them itself, as one that
+    only records, could not read what comes."""
 
     @property
     def external(self) -> dict[str, Any]:
@@ -98,7 +103,12 @@ def plan_links(
         exports = own & wanted
         blocking = {use.topic for use in read if use.topic in imports and _blocks(use)}
         crossing = {topic: remote[topic] for topic in sorted(exports | (imports - set(producers))) if topic in remote}
-        plans[process] = LinkPlan(tuple(sorted(exports)), tuple(sorted(imports)), tuple(sorted(blocking)), crossing)
+        homes = {
+            producers[topic].payload.__module__ for topic in imports & set(producers) if _is_message(producers[topic])
+        }
+        plans[process] = LinkPlan(
+            tuple(sorted(exports)), tuple(sorted(imports)), tuple(sorted(blocking)), crossing, tuple(sorted(homes))
+        )
     return plans
 
 
@@ -158,6 +168,10 @@ def _check(use: _Use, producers: Mapping[str, _Use], remote: Mapping[str, str]) 
         raise use.file.error(use.keys, f"topic {use.topic!r} carries {carried}{where}, not {wanted}")
 
 
+def _is_message(use: _Use) -> bool:
+    return isinstance(use.payload, type) and message_type(use.payload) is not None
+
+
 def _blocks(use: _Use) -> bool:
     return use.component.backlog.policy == "block" and use.keys[-1] in use.component.trigger.inputs
 
@@ -213,6 +227,8 @@ class Links:
         self._session: ZenohSession | None = None
         self._exports: dict[str, list[_Link]] = {}
         self._imports: dict[str, _Link] = {}
+        for home in plan.homes:
+            importlib.import_module(home)
 
     def start(self) -> None:
         """Begins to send and to receive what the plan says.

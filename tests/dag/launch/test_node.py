@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from importlib import import_module
 from pathlib import Path
 
 import psutil
@@ -115,6 +116,29 @@ components:
     config: {{path: {path}, when_full: block}}
     inputs: {{any: {sent}}}
 """
+
+
+REPORTS = """\
+module: {name}
+components:
+  - name: {name}
+    kind: data
+    class: warploom.components.node.statistics.StatisticsReporter
+    trigger: {{period_ms: 50}}
+    outputs: {{report: reports}}
+"""
+
+
+def test_a_process_that_only_records_knows_the_messages_of_others(start, module, launch_file, tmp_path):
+    recorder = module(RECORDER, "recorder", sent="reports", path=tmp_path / "run.mcap")
+    node = start("launch", launch_file(source=[module(REPORTS, "reports")], sink=[recorder])).up()
+    node.wait_until(lambda: node.process("sink")["components"][0]["state"].get("commits", 0) > 5)
+    assert not node.process("sink")["losses"]
+    assert node.stop() == 0
+    import_module("warploom.components.node.statistics")  # who reads the recording here must know them, too
+    (path,) = tmp_path.glob("run-*.mcap")
+    values = [event.value for event in Recording(path) if event.kind is EventKind.COMMIT]
+    assert {type(value).__name__ for value in values} == {"TopicsReport"}
 
 
 @pytest.fixture
