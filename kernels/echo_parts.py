@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from .beams import NO_HIT, UNIFORM
-from .echoes import DROP_REACH, DROP_ZONE
+from .echoes import DROP_REACH, DROP_ZONE, WITHIN
 
 __all__ = ["ECHO_BLOCK", "echo_part", "pack_echoes"]
 
@@ -21,7 +21,7 @@ ECHO_BLOCK = wp.constant(256)
 _ECHOES = f"""
     using namespace wp;
     constexpr int BLOCK = {int(ECHO_BLOCK)}, NO_HIT = {int(NO_HIT)};
-    constexpr float DROP_REACH = {float(DROP_REACH)!r}f, DROP_ZONE = {float(DROP_ZONE)!r}f;
+    constexpr float DROP_REACH = {float(DROP_REACH)!r}f, DROP_ZONE = {float(DROP_ZONE)!r}f, WITHIN = {float(WITHIN)!r}f;
     const auto uniform = [](const unsigned int seed, const unsigned int a, const unsigned int b) -> float {{{UNIFORM}}};
     const auto gauss = [&](const unsigned int seed, const unsigned int a, const unsigned int b) -> float {{
         const float u = uniform(seed, a, b) + uniform(seed + 1u, a, b);
@@ -37,20 +37,30 @@ _ECHOES = f"""
     const float* distance = distance_in.data + offset;
     const int* hit_label = hit_label_in.data + offset;
     const vec3* normal = normal_in.data + offset;
-    float cosine[BLOCK], reflectivity[BLOCK], loss[BLOCK], gloss[BLOCK], roughness[BLOCK];
+    float along[BLOCK], cosine[BLOCK], reflectivity[BLOCK], loss[BLOCK], gloss[BLOCK], roughness[BLOCK], mirror[BLOCK];
     float texture[BLOCK], lobe[BLOCK], signal[BLOCK], intensity[BLOCK], range[BLOCK];
     int kept[BLOCK];
     for (int j = 0; j < length; ++j) {{
         const int k = first + j;
         const quat turn = normalize(add(start, mul(fraction_in.data[k], way)));
-        cosine[j] = wp::abs(dot(quat_rotate(turn, beams_in.data[k]), normal[k]));
+        along[j] = dot(quat_rotate(turn, beams_in.data[k]), normal[k]);
+        cosine[j] = wp::abs(along[j]);
     }}
     for (int j = 0; j < length; ++j) {{
-        const float* material = material_in.data + (hit_label[first + j] & 255) * 5;
+        const float* material = material_in.data + (hit_label[first + j] & 255) * material_in.shape[1];
         reflectivity[j] = material[0];
         loss[j] = material[2];
         gloss[j] = material[3];
         roughness[j] = material[4];
+        mirror[j] = material[5];
+    }}
+    const float polish = polish_in.data[world];
+    for (int j = 0; j < length; ++j) {{
+        const float own = 0.2f + 0.8f * uniform(0x9E3779B9u, hit_instance_in.data[offset + first + j], 31u);
+        const float half = mirror[j] * polish * own;
+        const float steep = cosine[j] * cosine[j] * cosine[j];
+        const float within = (along[j] > 0.0f && mirror[j] > 0.0f) ? WITHIN : 1.0f;
+        mirror[j] = steep / (steep + half * half * half + 1.0e-12f) * within;
     }}
     for (int j = 0; j < length; ++j) {{
         const float d = distance[first + j];
@@ -66,7 +76,7 @@ _ECHOES = f"""
         for (int j = 0; j < length; ++j) signal[j] *= wp::exp(-rain[0] * distance[first + j]);
     for (int j = 0; j < length; ++j) {{
         const float cube = signal[j] * signal[j] * signal[j];
-        const float seen = cube / (1.0f + cube);
+        const float seen = cube / (1.0f + cube) * mirror[j];
         const float chance = uniform(seed, first + j, 3u);
         const int none = (distance[first + j] < min_range) | (hit_label[first + j] < 0)
             | (chance > seen * (1.0f - drop_out) * (1.0f - loss[j]));
@@ -130,6 +140,7 @@ def _echo(
     material_in: wp.array2d(dtype=wp.float32),
     seed_in: wp.array(dtype=wp.uint32),
     rain_in: wp.array(dtype=wp.vec2),
+    polish_in: wp.array(dtype=wp.float32),
     min_range: float,
     max_range: float,
     reach: float,
@@ -164,6 +175,7 @@ def echo_part(
     material_in: wp.array2d(dtype=wp.float32),
     seed_in: wp.array(dtype=wp.uint32),
     rain_in: wp.array(dtype=wp.vec2),
+    polish_in: wp.array(dtype=wp.float32),
     # in: sensor
     min_range: float,
     max_range: float,
@@ -188,8 +200,8 @@ def echo_part(
         first = (turn - world * blocks) * ECHO_BLOCK
         _echo(
             world, first, wp.min(first + ECHO_BLOCK, n), beams_in, fraction_in, ring_in, pose_in, distance_in,
-            hit_label_in, hit_instance_in, normal_in, material_in, seed_in, rain_in, min_range, max_range, reach,
-            range_noise, drop_out, edge_share, pulse, noise_label, kept_out, range_out, intensity_out, label_out,
+            hit_label_in, hit_instance_in, normal_in, material_in, seed_in, rain_in, polish_in, min_range, max_range,
+            reach, range_noise, drop_out, edge_share, pulse, noise_label, kept_out, range_out, intensity_out, label_out,
             instance_out,
         )  # fmt: skip
 

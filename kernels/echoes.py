@@ -1,9 +1,10 @@
 """What a LiDAR makes of the faces its beams meet: echoes with range, intensity, loss, mixed edges and rain.
 
-Signal: a Lambertian surface with a glossy lobe, falling with the square of the range; rain takes a share a metre and
-drops give echoes of their own (Goodin et al., "Predicting the influence of rain on LIDAR in ADAS", Electronics 2019:
-two-way attenuation exp(−0.02 R^0.6 z)). A beam is not a line: where its footprint lies over the edge between two
-surfaces that are nearer to each other than the pulse is long, the two echoes become one in between.
+Signal: a Lambertian surface with a glossy lobe, falling with the square of the range; what is polished mirrors beams
+away that graze it. Rain takes a share a metre and drops give echoes of their own (Goodin et al., "Predicting the
+influence of rain on LIDAR in ADAS", Electronics 2019: two-way attenuation exp(−0.02 R^0.6 z)). A beam is not a line:
+where its footprint lies over the edge between two surfaces that are nearer to each other than the pulse is long, the
+two echoes become one in between.
 
 All that looks like chance is a hash of seed and beam, so the same scene gives the same bytes again.
 """
@@ -14,16 +15,20 @@ import warp as wp
 
 from .beams import MATERIALS, NO_HIT, turn_at, uniform
 
-__all__ = ["DROP_REACH", "DROP_ZONE", "compact_echoes", "make_echoes"]
+__all__ = ["DROP_REACH", "DROP_ZONE", "WITHIN", "compact_echoes", "make_echoes"]
 
 DROP_REACH = wp.constant(4.0)
 """Mean range of the echoes of drops; farther ones are too weak [m]."""
 DROP_ZONE = wp.constant(10.0)
 """Within which they are seen [m]."""
 
+WITHIN = wp.constant(0.08)
+"""Share of the echoes from the inside of what mirrors on its outside."""
+
 _MATERIAL_MASK = wp.constant(MATERIALS - 1)
 _CLASS_SHIFT = wp.constant(8)
-_REFLECTIVITY, _LOSS, _GLOSS, _ROUGHNESS = (wp.constant(i) for i in (0, 2, 3, 4))
+_REFLECTIVITY, _LOSS, _GLOSS, _ROUGHNESS, _MIRROR = (wp.constant(i) for i in (0, 2, 3, 4, 5))
+_POLISH_SEED = wp.constant(wp.uint32(0x9E3779B9))
 
 
 @wp.func
@@ -77,6 +82,7 @@ def make_echoes(
     material_in: wp.array2d(dtype=wp.float32),
     seed_in: wp.array(dtype=wp.uint32),
     rain_in: wp.array(dtype=wp.vec2),
+    polish_in: wp.array(dtype=wp.float32),
     # in: sensor
     min_range: float,
     max_range: float,
@@ -121,7 +127,8 @@ def make_echoes(
                 return
     if d < min_range or label < 0:
         return
-    cosine = wp.abs(wp.dot(wp.quat_rotate(turn_at(pose_in, world, fraction_in[beam]), beams_in[beam]), normal_in[i]))
+    along = wp.dot(wp.quat_rotate(turn_at(pose_in, world, fraction_in[beam]), beams_in[beam]), normal_in[i])
+    cosine = wp.abs(along)
     material = label & _MATERIAL_MASK
     reflectivity = material_in[material, _REFLECTIVITY]
     gloss = material_in[material, _GLOSS]
@@ -139,6 +146,15 @@ def make_echoes(
         signal *= wp.exp(-rain[0] * d)
     cube = signal * signal * signal
     seen = cube / (1.0 + cube)
+    # Clear coat and glass send a beam that grazes them on, as a mirror does. Things are not equally well polished, and
+    # one is as polished in every sweep.
+    own = 0.2 + 0.8 * uniform(_POLISH_SEED, wp.uint32(hit_instance_in[i]), wp.uint32(31))
+    mirror = material_in[material, _MIRROR]
+    half = mirror * polish_in[world] * own
+    steep = cosine * cosine * cosine
+    # Behind such a surface, as a beam that came in through a window meets it, is a dark lining.
+    within = wp.where(along > 0.0 and mirror > 0.0, WITHIN, 1.0)
+    seen *= steep / (steep + half * half * half + 1.0e-12) * within
     chance = uniform(seed, k, wp.uint32(3))
     if chance > seen * (1.0 - drop_out) * (1.0 - material_in[material, _LOSS]):
         return

@@ -151,7 +151,8 @@ class LidarCast:
         hold("_pose", wp.zeros(2 * worlds, dtype=wp.transform, device=device))
         hold("_seed", wp.zeros(worlds, dtype=wp.uint32, device=device))
         hold("_rain", wp.zeros(worlds, dtype=wp.vec2, device=device))
-        hold("_material", wp.zeros((MATERIALS, 5), dtype=wp.float32, device=device))
+        hold("_polish", wp.full(worlds, 1.0, dtype=wp.float32, device=device))
+        hold("_material", wp.zeros((MATERIALS, 6), dtype=wp.float32, device=device))
         hold("_scene", [None] * worlds)
         hold("_scene_id", wp.zeros(worlds, dtype=wp.uint64, device=device))
         hold("_mesh", wp.zeros(rooms, dtype=wp.uint64, device=device))
@@ -176,13 +177,14 @@ class LidarCast:
             hold("_ray_direction", wp.zeros(n, dtype=wp.vec3, device=device))
 
     def set_materials(self, table: np.ndarray) -> None:
-        """Sets the table of materials, shape (256, 5).
+        """Sets the table of materials, shape (256, 6).
 
         Reflectivity, share of beams that pass, share of echoes that are lost, share of the echo that is a mirror's,
-        all in [0, 1], and the depth over which the surface spreads its echoes, as leaves do [m].
+        all in [0, 1], the depth over which the surface spreads its echoes, as leaves do [m], and the cosine of
+        incidence at which the best polished thing sends half of the echoes elsewhere.
         """
-        if np.shape(table) != (MATERIALS, 5):
-            raise ValueError(f"table must have shape ({MATERIALS}, 5), not {np.shape(table)}")
+        if np.shape(table) != (MATERIALS, 6):
+            raise ValueError(f"table must have shape ({MATERIALS}, 6), not {np.shape(table)}")
         self._material.assign(np.ascontiguousarray(table, np.float32))
 
     def place(
@@ -265,6 +267,17 @@ class LidarCast:
         row = [_RAIN_LOSS * density, min(_RAIN_ECHOES * density, _MOST_ECHOES)]
         self._rain[world : world + 1].assign(np.array([row], np.float32))
 
+    def set_polish(self, polish: float, *, world: int = 0) -> None:
+        """Sets how polished the glossy materials of a world are: a factor on the table's last column, 1 at first.
+
+        Raises:
+            ValueError: A factor that is negative or not finite, or no such world.
+        """
+        self._check_world(world)
+        if not 0 <= polish < np.inf:
+            raise ValueError(f"polish must be a number from 0, not {polish}")
+        self._polish[world : world + 1].assign(np.array([polish], np.float32))
+
     def _check_world(self, world: int) -> None:
         if not 0 <= world < self.worlds:
             raise ValueError(f"world must be 0 to {self.worlds - 1}, not {world}")
@@ -314,8 +327,8 @@ class LidarCast:
         self.cast()
         given = [
             self._beams, self._fraction, self._ring, self._pose, self.distance, self.hit_label, self.hit_instance,
-            self.hit_normal, self._material, self._seed, self._rain, self.min_range, self.max_range, self.reach,
-            self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
+            self.hit_normal, self._material, self._seed, self._rain, self._polish, self.min_range, self.max_range,
+            self.reach, self.range_noise, self.drop_out, self.edge_share, self.pulse, self.noise_label,
         ]  # fmt: skip
         echoes = [self._kept, self._range, self._intensity, self._label, self._instance]
         sensor = [self._ring, self._time]

@@ -328,16 +328,16 @@ def grow(street: Street, plan: StreetPlan, density: float) -> None:
 
 
 def clutter(street: Street, plan: StreetPlan) -> None:
-    """Adds what a head that had not seen it took for a car or missed: columns, gates, dense shrubs, cars of 3 m.
+    """Adds what a head that had not seen it took for a car or missed: columns, gates, dense shrubs, beds, cars of 3 m.
 
     Args:
-        street: As furnished and grown so far; some of its small parked cars become smaller.
+        street: As furnished so far, before it is grown over; some of its small parked cars become smaller.
         plan: Its measures.
     """
     random, add, things = street.random, street.add, street.things
     low, high = plan.extent
     line = plan.half_width + plan.sidewalk
-    for kind, most in (("column", 7), ("gate", 5), ("topiary", 18)):
+    for kind, most in (("column", 9), ("gate", 8), ("topiary", 24)):
         for _ in range(random.integers(0, most)):
             s, side = random.uniform(low, high), random.choice([-1, 1])
             near = plan.half_width + random.uniform(0.9, max(1.0, plan.sidewalk - 0.3))
@@ -347,6 +347,16 @@ def clutter(street: Street, plan: StreetPlan) -> None:
     for k in range(len(things)):
         if things.kind[k] in ("mini", "hatch", "coupe") and random.random() < 0.2:
             things.kind[k] = "micro"
+    # Beds lie along the curb and in front gardens, bastions hold up gardens above the sidewalk.
+    for kind, most, deep in (("flower_bed", 40, 2.0), ("bastion", 40, None), ("panel", 16, 3.0)):
+        for _ in range(random.integers(0, most)):
+            s, side = random.uniform(low, high), random.choice([-1, 1])
+            d = line + (random.gamma(1.1, deep) if deep else random.uniform(0.8, 7.0))
+            turned = (0.0 if side > 0 else np.pi) + random.normal(0, 0.1)
+            if kind != "bastion" and random.random() < 0.4:
+                turned = random.uniform(0.0, 2.0 * np.pi)
+            if plan.open_at(s, plan.sidewalk + 2.0):
+                add(kind, s, side * d, turned, margin=0.0)
 
 
 def _overgrow(street: Street, plan: StreetPlan) -> None:

@@ -63,38 +63,41 @@ class Material(IntEnum):
     MESH = 25
     PLASTIC = 26
     SOIL = 27
+    TINTED = 28
 
 
-# reflectivity, porosity (share of beams that pass), loss (share of echoes that are lost), gloss, roughness [m]
+# reflectivity, porosity (share of beams that pass), loss (share of echoes that are lost), gloss, roughness [m], and the
+# cosine of incidence at which the best polished one mirrors half of the echoes away: of cars by comparison with KITTI
 _PROPERTIES = {
-    Material.ASPHALT: (0.22, 0.0, 0.01, 0.0, 0.0),
-    Material.MARKING: (0.75, 0.0, 0.0, 0.0, 0.0),
-    Material.PAVING: (0.35, 0.0, 0.0, 0.0, 0.0),
-    Material.GRASS: (0.45, 0.0, 0.01, 0.0, 0.012),
-    Material.BRICK: (0.35, 0.0, 0.0, 0.0, 0.006),
-    Material.PLASTER: (0.55, 0.0, 0.0, 0.0, 0.0),
-    Material.CONCRETE: (0.4, 0.0, 0.0, 0.0, 0.0),
-    Material.WOOD: (0.4, 0.0, 0.0, 0.0, 0.0),
-    Material.WINDOW: (0.2, 0.55, 0.35, 0.6, 0.0),
-    Material.DARK_PAINT: (0.12, 0.0, 0.04, 0.3, 0.0),
-    Material.PAINT: (0.35, 0.0, 0.02, 0.3, 0.0),
-    Material.BRIGHT_PAINT: (0.65, 0.0, 0.01, 0.3, 0.0),
-    Material.GLASS: (0.15, 0.72, 0.55, 0.6, 0.0),
-    Material.TYRE: (0.08, 0.0, 0.05, 0.0, 0.0),
-    Material.LAMP: (0.9, 0.0, 0.0, 0.0, 0.0),
-    Material.PLATE: (1.0, 0.0, 0.0, 0.0, 0.0),
-    Material.INTERIOR: (0.18, 0.0, 0.1, 0.0, 0.03),
-    Material.BARK: (0.25, 0.0, 0.0, 0.0, 0.0),
-    Material.LEAVES: (0.45, 0.15, 0.05, 0.0, 0.06),
-    Material.METAL: (0.4, 0.0, 0.0, 0.2, 0.0),
-    Material.SIGN: (1.0, 0.0, 0.0, 0.0, 0.0),
-    Material.CLOTH: (0.4, 0.0, 0.01, 0.0, 0.006),
-    Material.DARK_CLOTH: (0.15, 0.0, 0.02, 0.0, 0.006),
-    Material.SKIN: (0.5, 0.0, 0.0, 0.0, 0.0),
-    Material.SPOKES: (0.3, 0.85, 0.2, 0.0, 0.0),
-    Material.MESH: (0.35, 0.8, 0.1, 0.0, 0.0),
-    Material.PLASTIC: (0.5, 0.0, 0.0, 0.1, 0.0),
-    Material.SOIL: (0.3, 0.0, 0.01, 0.0, 0.008),
+    Material.ASPHALT: (0.22, 0.0, 0.01, 0.0, 0.0, 0.0),
+    Material.MARKING: (0.75, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.PAVING: (0.35, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.GRASS: (0.45, 0.0, 0.01, 0.0, 0.012, 0.0),
+    Material.BRICK: (0.35, 0.0, 0.0, 0.0, 0.006, 0.0),
+    Material.PLASTER: (0.55, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.CONCRETE: (0.4, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.WOOD: (0.4, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.WINDOW: (0.2, 0.55, 0.35, 0.6, 0.0, 0.0),
+    Material.DARK_PAINT: (0.12, 0.0, 0.04, 0.3, 0.0, 0.13),
+    Material.PAINT: (0.35, 0.0, 0.02, 0.3, 0.0, 0.13),
+    Material.BRIGHT_PAINT: (0.65, 0.0, 0.01, 0.3, 0.0, 0.13),
+    Material.GLASS: (0.15, 0.6, 0.55, 0.6, 0.0, 0.25),
+    Material.TYRE: (0.08, 0.0, 0.05, 0.0, 0.0, 0.0),
+    Material.LAMP: (0.9, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.PLATE: (1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.INTERIOR: (0.18, 0.0, 0.35, 0.0, 0.03, 0.3),
+    Material.BARK: (0.25, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.LEAVES: (0.45, 0.15, 0.05, 0.0, 0.06, 0.0),
+    Material.METAL: (0.4, 0.0, 0.0, 0.2, 0.0, 0.0),
+    Material.SIGN: (1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.CLOTH: (0.4, 0.0, 0.01, 0.0, 0.006, 0.0),
+    Material.DARK_CLOTH: (0.15, 0.0, 0.02, 0.0, 0.006, 0.0),
+    Material.SKIN: (0.5, 0.0, 0.0, 0.0, 0.0, 0.0),
+    Material.SPOKES: (0.3, 0.85, 0.2, 0.0, 0.0, 0.0),
+    Material.MESH: (0.35, 0.8, 0.1, 0.0, 0.0, 0.0),
+    Material.PLASTIC: (0.5, 0.0, 0.0, 0.1, 0.0, 0.0),
+    Material.TINTED: (0.1, 0.15, 0.8, 0.6, 0.0, 0.25),
+    Material.SOIL: (0.3, 0.0, 0.01, 0.0, 0.008, 0.0),
 }
 
 
@@ -104,12 +107,12 @@ _WET_REFLECTIVITY, _WET_GLOSS = 0.45, 0.5
 
 
 def material_table(wetness: float = 0.0) -> np.ndarray:
-    """The properties of each material, as the ray caster takes them, shape (256, 5).
+    """The properties of each material, as the ray caster takes them, shape (256, 6).
 
     Args:
         wetness: Of roads, pavings, soil and concrete, from 0, dry, to 1, under a film of water.
     """
-    table = np.zeros((256, 5), np.float32)
+    table = np.zeros((256, 6), np.float32)
     for material, row in _PROPERTIES.items():
         table[material] = row
     wetted = list(_WETTED)

@@ -44,13 +44,16 @@ _STRUCTURES: dict[str, Callable[[np.random.Generator], Shape]] = {
     "column": yards.column,
     "gate": yards.gate,
     "topiary": yards.topiary,
+    "flower_bed": yards.flower_bed,
+    "bastion": yards.bastion,
+    "panel": yards.panel,
     "cone": structures.cone,
     "barrier": structures.barrier,
 }
 _VARIANTS = {
     "tree": 16, "bush": 24, "hedge": 10, "thicket": 14, "facade": 32, "wall": 14, "fence": 10, "lamp_post": 8,
     "sign": 8, "bollard": 4, "scrub": 18, "shed": 10, "heap": 10,
-    "column": 12, "gate": 8, "topiary": 14,
+    "column": 12, "gate": 8, "topiary": 14, "flower_bed": 12, "bastion": 12, "panel": 10,
     "bin": 6, "cabinet": 8, "hydrant": 2, "bike_rack": 8, "motorbike": 5, "bus_stop": 3, "table": 6, "stairs": 6,
     "cone": 4, "barrier": 8, "pedestrian": 24, "stander": 8, "cyclist": 12,
 }  # fmt: skip

@@ -23,16 +23,19 @@ __all__ = ["SceneBatch", "sample_scene", "sample_views"]
 
 _PERIOD = 0.1  # [s]
 _DRAWN = ("vlp16", "hdl32", "vlp32", "xt32", "pandar40", "hdl64", "pandar64", "pandar90", "vls128", "os1_128")
+_POLISH = (0.4, 1.6)
+"""Of cars that were washed in spring, and of new ones."""
 _OFTEN = {"hdl64": 11.0, "pandar64": 4.0}
 _workshop = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What a seed draws: a street, and where the ego vehicle stands or drives on it."""
+    """What a seed draws: a street, and where the ego vehicle stands or drives on it, and how shiny its cars are."""
 
     street: Street
     pose_at: Callable[[float], np.ndarray]
+    polish: float
 
 
 def _drawn_lidar(random: np.random.Generator) -> Lidar:
@@ -55,6 +58,7 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
             street.car_kind(heavy=0.12), random.uniform(-55, 55), random.normal(0, 10), random.uniform(0, 2 * np.pi)
         )
     furnish(street, plan, share)
+    clutter(street, plan)
     populate(street, plan, walkers=int(random.integers(3, 30)), riders=int(random.integers(0, 4)), cars=0, works=0)
     for _ in range(random.integers(0, 8)):
         kind = ("pedestrian", "cyclist", "cone", "barrier", "stander")[random.integers(5)]
@@ -67,7 +71,6 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
     speed = random.uniform(0.0, 14.0) if turning and random.random() < 0.8 else 0.0
     # Last, so that it changes nothing else of the scenes.
     grow(street, plan, random.uniform(0.1, 1.5 if style != "urban" else 0.7))
-    clutter(street, plan)
 
     def pose_at(t: float) -> np.ndarray:
         one = np.ones(1)
@@ -76,7 +79,7 @@ def _draw(random: np.random.Generator, mounting_height: float | None, turning: b
         upright = np.zeros(1, bool)
         return place(street.ground, at_s * one, at_d * one, heading * one, 0 * one, np.ones((1, 3)), upright)[0] @ mount
 
-    return _Scene(street, pose_at)
+    return _Scene(street, pose_at, random.uniform(*_POLISH))
 
 
 def sample_scene(
@@ -113,7 +116,7 @@ def sample_scene(
     scene = _draw(random, mounting_height, turning)
     return observe(
         World(scene.street, library), cast, model, scene.pose_at, 0.0, turn=_PERIOD if turning else 0.0, seed=seed,
-        index=0, version=START_NS, visibility=visibility,
+        index=0, version=START_NS, visibility=visibility, polish=scene.polish,
     )  # fmt: skip
 
 
@@ -145,7 +148,7 @@ def sample_views(
         frames.append(
             observe(
                 world, cast, model, pose_at, 1.5 * view, turn=0.0, seed=seed + 1_000_003 * view, index=view,
-                version=START_NS + view * 1_500_000_000, visibility=False,
+                version=START_NS + view * 1_500_000_000, visibility=False, polish=scene.polish,
             )
         )  # fmt: skip
         drawn = _drawn_lidar(random)
@@ -221,22 +224,22 @@ class SceneBatch:
         if not 0 < len(seeds) <= self._cast.worlds:
             raise ValueError(f"seeds must be 1 to {self._cast.worlds}, not {len(seeds)}")
         turn = _PERIOD if self.turning else 0.0
-        scenes: list[tuple[World, Callable[[float], np.ndarray]]] = []
+        scenes: list[tuple[World, Callable[[float], np.ndarray], float]] = []
         for number in range(self._cast.worlds):
             seed = int(seeds[min(number, len(seeds) - 1)])
             if number < len(seeds):
                 random = np.random.default_rng([seed, 11])
                 _drawn_lidar(random)  # so that the draws are those of `sample_scene`
                 scene = _draw(random, None, self.turning)
-                scenes.append((World(scene.street, self._library, ground=number), scene.pose_at))
+                scenes.append((World(scene.street, self._library, ground=number), scene.pose_at, scene.polish))
             # Worlds without a seed of their own repeat the last one: every beam needs a scene.
-            world, pose_at = scenes[-1]
-            set_scene(world, self._cast, pose_at, 0.0, turn=turn, seed=seed, number=number)
+            world, pose_at, polish = scenes[-1]
+            set_scene(world, self._cast, pose_at, 0.0, turn=turn, seed=seed, polish=polish, number=number)
         self._cast.launch()
         return [
             read_frame(
                 world, self._cast, self.lidar, pose_at, 0.0, turn=turn, index=0, version=START_NS,
                 visibility=visibility, number=number,
             )
-            for number, (world, pose_at) in enumerate(scenes)
+            for number, (world, pose_at, _) in enumerate(scenes)
         ]  # fmt: skip

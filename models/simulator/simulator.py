@@ -37,6 +37,7 @@ class Simulator:
         turning: bool = True,
         rain: float = 0.0,
         visibility: bool = False,
+        polish: float = 1.0,
         device: str = "cpu",
     ):
         """Builds the world.
@@ -52,19 +53,24 @@ class Simulator:
                 real one; else it is taken in an instant, and every point's time is 0.
             rain: How hard it rains [mm/h]; surfaces are wet from the first drop on.
             visibility: Whether frames say how much of each object can be seen.
+            polish: How far paint and glass mirror away beams that graze them; 1 as real cars do on the whole, 0 not at
+                all.
             device: Where rays are cast.
 
         Raises:
-            ValueError: No such scenario or sensor, or a length of time that is not positive.
+            ValueError: No such scenario or sensor, a length of time that is not positive, or a polish below 0.
             DeviceError: No such device.
         """
         for name, value in (("duration", duration), ("rate", rate), ("mounting_height", mounting_height)):
             if not value > 0:
                 raise ValueError(f"{name} must be > 0, not {value}")
+        if not 0 <= polish < np.inf:
+            raise ValueError(f"polish must be a number from 0, not {polish}")
         self.seed, self.rate, self.duration, self.rain = seed, rate, duration, rain
         self.mounting_height, self.turning, self.visibility = mounting_height, turning, visibility
         self.lidar = lidar_model(lidar) if isinstance(lidar, str) else lidar
         drive = build_drive(scenario, seed, duration)
+        self.polish = polish
         self._ego = EgoPath(drive.street.ground, drive.lane, np.array(drive.motion), duration)
         library = Library(resolve_device(device))
         self._world = World(drive.street, library)
@@ -123,7 +129,7 @@ class Simulator:
             return observe(
                 self._world, self._cast, self.lidar, self.pose, t, turn=1.0 / self.rate if self.turning else 0.0,
                 seed=self.seed * 1_000_003 + index, index=index, version=self.version(index),
-                visibility=self.visibility,
+                visibility=self.visibility, polish=self.polish,
             )  # fmt: skip
 
     def image(self, index: int, camera: Camera, *, delay: float = 0.0) -> CameraFrame:

@@ -140,6 +140,8 @@ def _car(body: _Body, random: np.random.Generator) -> Shape:
     knots = knots + jitter
     wheel = body.wheel * random.uniform(0.94, 1.06)
     axles = [(a - 0.5) * length for a in body.axles]
+    bows, power = random.uniform(0.06, 0.22, 2), random.uniform(2.2, 4.0)
+    tinted = random.random() < 0.7
     arch = wheel + 0.05
 
     fractions = np.unique(
@@ -155,9 +157,10 @@ def _car(body: _Body, random: np.random.Generator) -> Shape:
     top = np.interp(fractions, knots[:, 0], knots[:, 1] * height / knots[:, 1].max())
     belt = np.interp(fractions, [0, 1], body.belt) * height
     cabin = top > belt + 0.03
-    # In plan the ends are rounded: full width amidships, narrower at the bumpers.
+    # In plan flanks are bowed, vans' less behind: full width amidships, narrower by some 0.3 m at the bumpers.
     end = np.abs(2 * fractions - 1)
-    half = 0.5 * width * (1 - 0.05 * end**4 - 0.16 * np.clip((end - 0.86) / 0.14, 0, 1) ** 2.5)
+    bow = np.where(fractions > 0.5, bows[0], bows[1] * (1.0 if body.taper > 0.1 else 0.3)) * end**power
+    half = 0.5 * width * (1 - bow - 0.12 * np.clip((end - 0.86) / 0.14, 0, 1) ** 2.5)
     sill = np.interp(fractions, [0, 0.03, 0.08, 0.92, 0.97, 1], np.array([1.55, 1.2, 1, 1, 1.15, 1.35]) * body.sill)
     low = sill.copy()
     for axle in axles:
@@ -190,17 +193,18 @@ def _car(body: _Body, random: np.random.Generator) -> Shape:
         pillar |= (mid > p) & (mid < p + 0.022)
     side = cell_cabin & ~pillar & (mid > max(body.side_glass[0], 0.05)) & (mid < body.front_glass[1] - 0.03)
     side &= mid < body.side_glass[1]
+    rear_glass = _label(Material.TINTED) if tinted else glass
     labels[np.ix_(side, [4, 9])] = glass
-    for start, stop in (body.rear_glass, body.front_glass):
+    labels[np.ix_(side & (mid < body.pillars[max(len(body.pillars) - 2, 0)]), [4, 9])] = rear_glass
+    for (start, stop), pane in ((body.rear_glass, rear_glass), (body.front_glass, glass)):
         screen = (mid > start) & (mid < stop)
-        labels[np.ix_(screen, [6, 7])] = glass
-        labels[np.ix_(screen, [5, 8])] = glass
+        labels[np.ix_(screen, [5, 6, 7, 8])] = pane
     for ends in ((mid > 0.955) & (mid < 0.99), (mid < 0.02) & (mid > 0.004)):
         labels[np.ix_(ends, [3, 10])] = _label(Material.LAMP)
     shell = loft(sections, labels, closed=True, caps=paint)
 
     front, back = 0.5 * length, -0.5 * length
-    parts = [shell, _wheels(axles, 0.5 * width - 0.015, wheel)]
+    parts = [shell, *(_wheels([axle], float(np.interp(axle, x, half)) - 0.015, wheel) for axle in axles)]
     floor, seat = 0.28 * height, 0.68 * height
     for fraction, reach in ((0.52, 1.0), (0.30, 1.0)):
         if fraction < body.side_glass[0]:
@@ -209,6 +213,11 @@ def _car(body: _Body, random: np.random.Generator) -> Shape:
         for y in (-0.25 * width, 0.25 * width):
             parts.append(box((at - 0.1, y - 0.22, floor), (at + 0.02, y + 0.22, seat * reach), interior))
             parts.append(box((at, y - 0.22, floor), (at + 0.45, y + 0.22, 0.4 * height), interior))
+            parts.append(box((at - 0.08, y - 0.13, seat), (at + 0.02, y + 0.13, 0.82 * height), interior))
+    if body.side_glass[0] < 0.3:
+        # The shelf behind the seats: beams that come in through a window do not meet the tailgate from within.
+        shelf = (np.array([max(body.rear_glass[0], 0.015), 0.32]) - 0.5) * length
+        parts.append(box((shelf[0], -0.4 * width, 0.54 * height), (shelf[1], 0.4 * width, 0.6 * height), interior))
     dash = (body.front_glass[1] - 0.5) * length
     parts.append(box((dash - 0.65, -0.42 * width, floor), (dash - 0.2, 0.42 * width, 0.58 * height), interior))
     plate, at = _label(Material.PLATE), 0.30 * height

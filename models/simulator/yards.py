@@ -7,7 +7,7 @@ import numpy as np
 from .labels import Material, PointClass, face_label
 from .mesh import Shape, box, ellipsoid, join, leaves, loft, quad, tube
 
-__all__ = ["column", "gate", "heap", "shed", "topiary"]
+__all__ = ["bastion", "column", "flower_bed", "gate", "heap", "panel", "shed", "topiary"]
 
 
 def shed(random: np.random.Generator) -> Shape:
@@ -98,3 +98,60 @@ def topiary(random: np.random.Generator) -> Shape:
     points += random.normal(0, 0.04, (count, 3))
     points[:, 2] = np.clip(points[:, 2], 0.02, height + 0.05)
     return join(core, leaves(points, random.uniform(0.07, 0.14), label, random))
+
+
+def flower_bed(random: np.random.Generator) -> Shape:
+    """A bed of low plants or ground cover, as broad as a car: 2 to 6 m long, 0.3 to 0.9 m high, uneven on top."""
+    length, depth, height = random.uniform(2.0, 6.0), random.uniform(1.0, 2.6), random.uniform(0.3, 0.9)
+    label = face_label(Material.LEAVES, PointClass.VEGETATION)
+    count = int(min(30 * length * depth, 420))
+    x, y = random.uniform(-0.5, 0.5, (2, count)) * np.array([[length], [depth]])
+    bumps = np.sin(x * random.uniform(1, 4) + random.uniform(0, 6)) * np.sin(y * random.uniform(1, 4))
+    z = height * np.clip(random.uniform(0.55, 1.0, count) + 0.2 * bumps, 0.1, 1.0)
+    parts = [leaves(np.stack([x, y, z], 1), random.uniform(0.06, 0.16), label, random)]
+    if random.random() < 0.6:
+        half = 0.46 * np.array([length, depth])
+        parts.append(box((-half[0], -half[1], 0.0), (half[0], half[1], random.uniform(0.3, 0.7) * height), label))
+    if random.random() < 0.3:
+        stone = face_label(Material.CONCRETE, PointClass.OTHER)
+        half = 0.5 * np.array([length, depth]) + 0.1
+        parts.append(box((-half[0], -half[1], -0.2), (half[0], half[1], random.uniform(0.1, 0.45)), stone))
+    return join(*parts)
+
+
+def bastion(random: np.random.Generator) -> Shape:
+    """A wall that bulges towards -y, 3 to 9 m along x and 0.5 to 1.6 m high, with plants on the ground behind it."""
+    chord, height, bulge = random.uniform(3.0, 9.0), random.uniform(0.5, 1.6), random.uniform(0.4, 2.2)
+    material = (Material.BRICK, Material.CONCRETE, Material.PLASTER)[random.integers(3)]
+    label = face_label(material, PointClass.FENCE)
+    t = np.linspace(-1.0, 1.0, 13)
+    front = np.stack([0.5 * chord * t, -bulge * (1.0 - t * t)], 1)
+    low, high = (np.concatenate([front, np.full((13, 1), z)], 1) for z in (-0.3, height))
+    back = np.stack([0.5 * chord * t, np.full(13, 0.3), np.full(13, height)], 1)
+    parts = [loft(np.stack([low, high, back]), label)]
+    green = face_label(Material.LEAVES, PointClass.VEGETATION)
+    for _ in range(random.integers(0, 6)):
+        x = random.uniform(-0.4, 0.4) * chord
+        radii = np.array([random.uniform(0.3, 1.1), random.uniform(0.25, 0.7), random.uniform(0.25, 0.8)])
+        centre = np.array([x, random.uniform(-0.6, 0.4) * bulge, height + 0.6 * radii[2]])
+        way = random.normal(size=(random.integers(60, 160), 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        points = centre + way * radii * random.uniform(0.7, 1.0, (len(way), 1))
+        points[:, 2] = np.maximum(points[:, 2], height)
+        parts.append(leaves(points, random.uniform(0.08, 0.18), green, random))
+    return join(*parts)
+
+
+def panel(random: np.random.Generator) -> Shape:
+    """A hoarding, a billboard or a fence's end: flat, 2 to 5 m long, 1.2 to 2.4 m high, from the ground or not."""
+    length, height, foot = random.uniform(2.0, 5.0), random.uniform(1.2, 2.4), random.choice([0.0, 0.1, 0.4, 0.8])
+    label = face_label((Material.WOOD, Material.METAL, Material.PLASTER)[random.integers(3)], PointClass.FENCE)
+    thick = random.uniform(0.02, 0.2)
+    parts = [box((-0.5 * length, -thick, foot), (0.5 * length, thick, height), label)]
+    for x in np.linspace(-0.5 * length, 0.5 * length, int(random.integers(2, 4))):
+        parts.append(box((x - 0.06, -thick - 0.06, -0.2), (x + 0.06, thick + 0.06, height), label))
+    if random.random() < 0.4:
+        wing = random.uniform(0.5, 2.0) * random.choice([-1.0, 1.0])
+        y = sorted((0.0, wing))
+        parts.append(box((0.5 * length - 0.05, y[0], foot), (0.5 * length + 0.05, y[1], height), label))
+    return join(*parts)

@@ -47,6 +47,8 @@ class TrainingFrame:
     """Above the ground around the sensor [m]."""
     velocities: np.ndarray = field(default_factory=lambda: np.empty((0, 2), np.float32))
     """Over ground along x and y [m/s], shape (k, 2), float32; of no rows where they are unknown."""
+    bowed: bool = False
+    """Whether its vehicles are bowed in plan and polished, as real ones are and those of earlier renderings are not."""
 
 
 class _Simulated(Protocol):
@@ -94,6 +96,7 @@ def _training_frame(frame: _Simulated) -> TrainingFrame:
         points_in=np.asarray(frame.counts, np.int32),
         sensor_height=height_over_ground(points, np.asarray(frame.ground, bool)[inside]),
         velocities=np.asarray(frame.velocities, np.float32).reshape(-1, 2),
+        bowed=True,
     )
 
 
@@ -109,6 +112,7 @@ def save_frame(path: Path, frame: TrainingFrame) -> None:
         points_in=frame.points_in,
         sensor_height=np.float32(frame.sensor_height),
         velocities=frame.velocities,
+        bowed=np.bool_(frame.bowed),
     )
     os.replace(partial, path)
 
@@ -124,6 +128,7 @@ def load_frame(path: Path) -> TrainingFrame:
             points_in=stored["points_in"],
             sensor_height=float(stored["sensor_height"]),
             velocities=stored["velocities"] if "velocities" in stored else np.empty((0, 2), np.float32),
+            bowed="bowed" in stored and bool(stored["bowed"]),
         )
 
 
@@ -205,4 +210,5 @@ def augment(frame: TrainingFrame, rng: np.random.Generator, options: Augmentatio
         points_in=np.floor(frame.points_in * share).astype(np.int32),
         sensor_height=rng.uniform(-options.height, options.height),
         velocities=frame.velocities @ (matrix[:2, :2] / np.float32(scale)).T,
+        bowed=frame.bowed,
     )

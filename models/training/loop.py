@@ -18,6 +18,7 @@ import warp as wp
 from torch.utils.data import DataLoader, IterableDataset
 
 from ...kernels.pillar import PillarGrid, pillar_channels
+from .bowing import bowed
 from .frames import (
     Augmentation,
     TrainingFrame,
@@ -161,7 +162,7 @@ def make_views(folder: Path, seeds: range, views: int, nice: int = 0) -> None:
 def _sample(frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator) -> Window:
     """One variation of a frame."""
     frame = replace(frame, boxes=labelled_boxes(frame.boxes, frame.classes))
-    varied = augment(frame, rng, config.augmentation)
+    varied = augment(bowed(frame, rng), rng, config.augmentation)
     xyz = np.ascontiguousarray(varied.xyz)[: grid.capacity]
     points = wp.array(ptr=xyz.ctypes.data, dtype=wp.vec3, shape=(len(xyz),), device="cpu")
     grid.launch(points, wp.array([len(xyz)], dtype=wp.int32, device="cpu"), varied.sensor_height)

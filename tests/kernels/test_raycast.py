@@ -175,10 +175,10 @@ PLAIN, GHOST, HALF = 1, 2, 3
 
 
 def materials():
-    table = np.zeros((MATERIALS, 5), np.float32)
-    table[PLAIN] = 1.0, 0.0, 0.0, 0.0, 0.0
-    table[GHOST] = 1.0, 1.0, 0.0, 0.0, 0.0
-    table[HALF] = 1.0, 0.5, 0.0, 0.0, 0.0
+    table = np.zeros((MATERIALS, 6), np.float32)
+    table[PLAIN] = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    table[GHOST] = 1.0, 1.0, 0.0, 0.0, 0.0, 0.0
+    table[HALF] = 1.0, 0.5, 0.0, 0.0, 0.0, 0.0
     return table
 
 

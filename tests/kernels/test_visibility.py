@@ -22,7 +22,7 @@ def shares(transforms, labels, motion=None, **options):
     for label in (PLAIN, GHOST):
         meshes.add(PLATE, np.array([[0, 1, 2], [0, 2, 3]]), np.full(2, label))
     cast = LidarCast(meshes=meshes, beams=np.eye(3), ring=np.zeros(3), time=np.zeros(3), max_range=60.0)
-    table = np.zeros((MATERIALS, 5), np.float32)
+    table = np.zeros((MATERIALS, 6), np.float32)
     table[GHOST, 1] = 1.0
     cast.set_materials(table)
     cast.place(np.array(labels) - 1, np.array(transforms), motion)

@@ -67,6 +67,21 @@ def test_a_car_is_no_box():
     assert (shape.labels % 256 == Material.GLASS).any()
 
 
+def test_flanks_of_cars_are_bowed_and_boxes_as_wide_as_their_middle():
+    for kind in ("hatch", "sedan", "wagon", "suv"):
+        for variant in range(4):
+            made = prototype(kind, variant)
+            length, width, height = made.size
+            x, y, z = made.shape.vertices[made.shape.boxed].T
+            body = (z > 0.3 * height) & (z < 0.6 * height)
+            half = [np.abs(y[body & (np.abs(x / length - at) < 0.03)]).max() for at in (-0.45, -0.25, 0.0, 0.25, 0.45)]
+            assert half[2] == pytest.approx(width / 2, abs=0.03)  # the middle of the lofted side is a little inside
+            # Each bumper is 2 % to 22 % narrower at nine tenths of the way, and the flank goes there step by step.
+            for end, between in ((half[0], half[1]), (half[4], half[3])):
+                assert 0.7 * half[2] < end < 0.98 * half[2]
+                assert end < between <= half[2]
+
+
 def test_walkers_swing_their_legs():
     lengths = [prototype("pedestrian", 3, phase).size[0] for phase in range(8)]
     assert max(lengths) - min(lengths) > 0.15
@@ -82,7 +97,7 @@ def test_kinds_have_their_classes():
 
 def test_materials_are_shares():
     table = material_table()
-    assert table.shape == (256, 5)
+    assert table.shape == (256, 6)
     assert table.min() >= 0
     assert table.max() <= 1
     assert (table[: len(Material), 0] > 0).all()

@@ -1,9 +1,13 @@
-"""Batches of scenes against the same scenes one by one."""
+"""Random scenes: batches of them against the same ones alone, what is in them, and how cars look in them."""
+
+from collections import Counter
 
 import numpy as np
 import pytest
 
-from warploom.models.simulator import SceneBatch, sample_scene
+from warploom.models.classes import VEHICLE
+from warploom.models.simulator import PointClass, SceneBatch, Simulator, sample_scene
+from warploom.models.simulator.scenes import _draw
 
 
 def fields(frame):
@@ -43,3 +47,43 @@ def test_the_mounting_height_can_be_given():
     frame = sample_scene(3, lidar="vlp16", mounting_height=3.0)
     near = frame.ground & (np.linalg.norm(frame.points[:, :2], axis=1) < 15)
     assert np.median(frame.points[near, 2]) == pytest.approx(-3.0, abs=0.3)
+
+
+def test_streets_are_cluttered():
+    """What clutters comes before the land is grown over, or there is no room for it."""
+    kinds = Counter()
+    for seed in range(6):
+        scene = _draw(np.random.default_rng([seed, 11]), None, False)
+        kinds.update(scene.street.things.kind)
+    for kind in ("column", "gate", "topiary", "flower_bed", "bastion", "panel"):
+        assert kinds[kind] >= 3  # of at most 4 to 39 a scene
+    assert sum(kinds[kind] for kind in ("flower_bed", "bastion", "topiary")) >= 40
+
+
+def test_the_far_ends_of_cars_seen_along_their_flank_return_little():
+    """KITTI's labelled cars seen so have their last points 0.6 m before the end of the box in the median."""
+    ends = []
+    for seed in range(500, 508):
+        frame = sample_scene(seed, lidar="hdl64", mounting_height=1.73)
+        for k in np.flatnonzero((frame.classes == VEHICLE) & (frame.counts > 150)):
+            box = frame.boxes[k].astype(np.float64)
+            c, s = np.cos(box[6]), np.sin(box[6])
+            sensor = np.array([-(box[0] * c + box[1] * s), box[0] * s - box[1] * c])
+            half = 0.5 * box[3:5]
+            grazing = abs(sensor[0]) > 2.5 * (abs(sensor[1]) - half[1])
+            if not 3.2 < box[3] < 5.0 or abs(sensor[1]) < half[1] + 1.0 or not grazing:
+                continue
+            apart = frame.points[frame.instance == frame.ids[k], :2] - box[:2]
+            along = (apart[:, 0] * c + apart[:, 1] * s) * np.sign(sensor[0])
+            ends.append(np.percentile(along, 0.7) + half[0])
+    assert len(ends) > 8
+    assert 0.3 < np.median(ends) < 0.9
+
+
+def test_polish_takes_echoes_from_vehicles_alone():
+    dull, shiny = (Simulator(seed=3, lidar="vlp16", duration=0.1, polish=p, turning=False).frame(0) for p in (0.0, 2.0))
+    on = [frame.point_class == PointClass.VEHICLE for frame in (dull, shiny)]
+    assert on[1].sum() < 0.95 * on[0].sum()
+    assert (~on[1]).sum() == pytest.approx((~on[0]).sum(), rel=0.01)  # panes of bus stops are polished too
+    with pytest.raises(ValueError, match="polish"):
+        Simulator(polish=-1.0)
