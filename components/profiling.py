@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,6 +20,9 @@ __all__ = ["Measurement", "Proposal", "StageTimes", "Times", "look", "measure_pr
 
 WARM_UP = 5
 """Frames at the start of a drive whose times are left out: memory is touched for the first time there."""
+
+_BUSY = 1.0
+"""A load beyond which what is measured is not the profile's alone."""
 
 _LARGE_GPU_GIB = 60.0
 _SMALL_HOST_GIB = 3.0
@@ -89,6 +93,8 @@ class Measurement:
     """By vertex, as `component.vertex`; branches run side by side, so they do not add up to the total."""
     prepare_s: float
     """To build everything, kernels compiled [s]."""
+    load: float | None = None
+    """How many processes wanted a core in the minute before, on average; None: unknown here."""
 
     @property
     def holds(self) -> bool:
@@ -188,6 +194,7 @@ def measure_profile(
         ModelError: Its model does not fit its card.
         ValueError: There are no more frames than those for warming up.
     """
+    load = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
     started = time.perf_counter()
     pipeline = Pipeline.from_profile(name, device=device, settings=list(settings))
     prepared = time.perf_counter() - started
@@ -217,6 +224,7 @@ def measure_profile(
             total=Times.of([one.total for one in timed]) if timed else None,
             stages=stages,
             prepare_s=round(prepared, 2),
+            load=load,
         )
 
 
@@ -248,6 +256,8 @@ def verdict_lines(measured: Measurement) -> list[str]:
         times = measured.stages[slowest]
         lines.append(f"most of it is {slowest}: {times.run.p95:.1f} ms, and {times.wait.p95:.1f} ms of waiting for it")
         lines.append(_way_out(slowest, measured))
+    if measured.load is not None and measured.load > _BUSY:
+        lines.append(f"the machine was busy before it began (load {measured.load:g}): measure again on a quiet one")
     return lines
 
 

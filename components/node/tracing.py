@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import re
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -22,6 +24,8 @@ from ..pipeline import LIDAR_TOPIC, OBSTACLES_TOPIC
 
 __all__ = ["TraceWriter", "TraceWriterConfig"]
 
+_KEPT = 5
+
 _log = logging.getLogger(__name__)
 
 
@@ -37,7 +41,8 @@ class TraceWriterConfig(ProcessorConfig):
     """Where to, and how much."""
 
     file: str = "trace-{name}-{pid}.json"
-    """The file; one without a folder lies beside the folders of nodes, such as in $WARPLOOM_RUN."""
+    """The file; one without a folder lies beside the folders of nodes, such as in $WARPLOOM_RUN, and there the newest
+    five of its name are kept."""
     seconds: float = Field(30.0, ge=0.0)
     """How long is traced from the start [s]; 0: nothing. A second of perception is some 100 kB."""
     sources: tuple[str, ...] = (LIDAR_TOPIC,)
@@ -88,11 +93,23 @@ class TraceWriter(Component):
             path = _run_base() / path
         return path
 
+    def _remove_old(self) -> None:
+        """Each life makes a file: of those beside the folders of nodes there are to be few, this one included."""
+        if Path(self._config.file).parent != Path():
+            return
+        before, _, after = self._config.file.format(name=self.name, pid="\0").partition("\0")
+        pattern = re.compile(rf"{re.escape(before)}\d+{re.escape(after)}")
+        with contextlib.suppress(OSError):
+            old = [one for one in _run_base().iterdir() if pattern.fullmatch(one.name)]
+            for one in sorted(old, key=lambda one: one.stat().st_mtime_ns)[: 1 - _KEPT]:
+                one.unlink(missing_ok=True)
+
     def start(self) -> None:
         """Creates the file and begins."""
         if self._config.seconds == 0.0:
             return
         assert self._mesh is not None
+        self._remove_old()
         try:
             self._trace = Trace(self._path(self._config), self.name)
         except SinkError as error:

@@ -1,5 +1,6 @@
 """warploom profile: what is proposed for which machine, what is measured, and what is said of it."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -113,6 +114,9 @@ def test_a_budget_that_does_not_hold_is_told_with_the_slowest_stage_and_the_way_
     assert lines[1] == "most of it is perception.detect: 110.0 ms, and 0.1 ms of waiting for it"
     assert "models.detector" in lines[2]
     assert "a GPU" in lines[2]
+    assert "busy" not in lines[-1]
+    late = measured((120.0, 150.0, 160.0), perception__detect=(0.1, 110.0))
+    assert "load 3.2): measure again" in verdict_lines(dataclasses.replace(late, load=3.2))[-1]
     other = verdict_lines(measured((120.0, 150.0, 160.0), device="cuda:0", perception__cluster=(0.1, 110.0)))
     assert "gpu-chain" in other[2]
     assert verdict_lines(measured(total=None)) == [

@@ -1,6 +1,7 @@
 """The metric agent and the trace: what they tell of a process, and that they cost nothing when they cannot."""
 
 import json
+import os
 import socket
 import urllib.request
 
@@ -109,6 +110,19 @@ def test_the_trace_holds_commits_and_vertices_until_its_time_is_over(tmp_path):
     assert "commit perception/obstacles" in names
     assert one.idle_because == "the first 5 s are written"
     assert one.state()["events_dropped"] == 0
+
+
+def test_of_the_lives_before_the_newest_traces_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPLOOM_RUN", str(tmp_path))
+    for pid in range(1, 8):
+        (tmp_path / f"trace-tracer-{pid}.json").write_text("{}")
+        os.utime(tmp_path / f"trace-tracer-{pid}.json", (pid, pid))
+    (tmp_path / "trace-other-1.json").write_text("{}")
+    one, *_ = writer(tmp_path, ExecutionContext(), file="trace-{name}-{pid}.json")
+    one.start()
+    one.stop()
+    own = [f"trace-tracer-{pid}.json" for pid in (4, 5, 6, 7, os.getpid())]
+    assert {path.name for path in tmp_path.iterdir()} == {*own, "trace-other-1.json"}
 
 
 def test_a_stop_before_that_writes_the_trace_to_its_end(tmp_path):
