@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals, wholes
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
@@ -296,8 +297,8 @@ class BevMaps:
     """Height [m], intensity and density per cell, shape (3, rows, columns), float32; zero where there is no point."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         low, high = self.point_range[:3], self.point_range[3:]
         if len(self.point_range) != 6 or not all(
             a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)
@@ -411,12 +412,12 @@ def bev(points: Any, point_range: Sequence[float], shape: Sequence[int], *, back
     if uses_taichi(backend):
         from .taichi import bev as in_taichi
 
-        return in_taichi.bev(borrowed, point_range, shape)
+        return in_taichi.bev(borrowed, reals(point_range, "point_range"), wholes(shape, "shape"))
     plan = plan_for(
         BevMaps,
         capacity=capacity_for(len(borrowed)),
-        point_range=tuple(float(limit) for limit in point_range),
-        shape=tuple(int(length) for length in shape),
+        point_range=reals(point_range, "point_range"),
+        shape=wholes(shape, "shape"),
         device=borrowed.device,
     )
     count = count_on(len(borrowed), borrowed.device)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real
 from .box_hull import RUN, find_hulls, find_hulls_in_parts, fit_hulls, fit_hulls_in_parts
 from .box_l_shape import (
     DIRECTIONS,
@@ -235,10 +236,10 @@ class FitBoxes:
     """Labelled points left out: not finite, of labels from `max_clusters`; shape (2,), int32."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
-        if self.max_clusters < 1:
-            raise ValueError(f"max_clusters must be at least 1, not {self.max_clusters}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
+        if not 1 <= self.max_clusters < 2**31:
+            raise ValueError(f"max_clusters must be at least 1 and below 2³¹, not {self.max_clusters}")
         if self.method not in _METHODS:
             raise ValueError(f"method must be one of {', '.join(_METHODS)}, not {self.method!r}")
         if not self.min_size > 0:
@@ -379,7 +380,7 @@ def fit_boxes(points: Any, labels: Any, *, method: str = "l_shape", min_size: fl
         capacity=capacity_for(n),
         max_clusters=max(64, 1 << (max(k, 1) - 1).bit_length()),
         method=method,
-        min_size=float(min_size),
+        min_size=real(min_size, "min_size"),
         device=borrowed.device,
     )
     plan.launch(borrowed.xyz, clusters, count_on(n, borrowed.device))

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from . import device as _device  # noqa: F401  (starts Warp)
+from .arguments import table
 from .interop import borrow, family_of
 
 __all__ = ["Camera", "borrow_image", "camera_model", "image_point", "is_in_image"]
@@ -49,8 +50,8 @@ def camera_model(camera_from_points: Any, intrinsics: Any, distortion: Sequence[
     Raises:
         ValueError: A shape or a number does not fit; the message says which.
     """
-    pose, matrix = (np.ascontiguousarray(array, np.float64) for array in (camera_from_points, intrinsics))
-    numbers = np.zeros(0) if distortion is None else np.asarray(distortion, np.float64).ravel()
+    pose, matrix = table(camera_from_points, "camera_from_points"), table(intrinsics, "intrinsics")
+    numbers = np.zeros(0) if distortion is None else table(distortion, "distortion").ravel()
     return _camera(pose.shape, pose.tobytes(), matrix.shape, matrix.tobytes(), numbers.tobytes())
 
 

@@ -174,8 +174,8 @@ class KernelChain:
     """All counts of the frame, in the order of `COUNTS` in `chain_result`, shape (n,), int32; `result` reads it."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         device = resolve_device(self.device)
         object.__setattr__(self, "device", device)
         config, room = self.config, {"capacity": self.capacity, "device": device}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, whole
 from .backend import uses_taichi
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, join_levels, radius_of, touch, unite
@@ -120,8 +121,8 @@ class EuclideanCluster:
                 f"not {self.radius_per_metre}"
             )
         for name in ("min_size", "capacity"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
@@ -262,17 +263,19 @@ def cluster(
             `radius_per_metre` is not from 0 to 1; or there is no such backend.
         ImportError: The backend is Taichi, which is not installed.
     """
+    radius, radius_per_metre = real(radius, "radius"), real(radius_per_metre, "radius_per_metre")
+    min_size = whole(min_size, "min_size")
     borrowed = borrow_points(points)
     n = len(borrowed)
     if uses_taichi(backend):
         from .taichi import cluster as in_taichi
 
-        return in_taichi.cluster(borrowed, float(radius), int(min_size), float(radius_per_metre))
+        return in_taichi.cluster(borrowed, radius, min_size, radius_per_metre)
     plan = plan_for(
         EuclideanCluster,
-        radius=float(radius),
-        radius_per_metre=float(radius_per_metre),
-        min_size=int(min_size),
+        radius=radius,
+        radius_per_metre=radius_per_metre,
+        min_size=min_size,
         capacity=capacity_for(n),
         device=borrowed.device,
     )

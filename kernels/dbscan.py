@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, whole
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, find, is_near, radius_of, touch, unite
 from .cell_table import CellTable, cell_at, free_slot
@@ -293,8 +294,8 @@ class Dbscan:
         if not (self.eps >= _SMALLEST_EPS and math.isfinite(self.eps)):
             raise ValueError(f"eps must be a positive number of metres (at least {_SMALLEST_EPS}), not {self.eps}")
         for name in ("min_points", "capacity"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
@@ -460,7 +461,11 @@ def dbscan(points: Any, eps: float, min_points: int) -> Any:
     borrowed = borrow_points(points)
     n = len(borrowed)
     plan = plan_for(
-        Dbscan, eps=float(eps), min_points=int(min_points), capacity=capacity_for(n), device=borrowed.device
+        Dbscan,
+        eps=real(eps, "eps"),
+        min_points=whole(min_points, "min_points"),
+        capacity=capacity_for(n),
+        device=borrowed.device,
     )
     plan.launch(borrowed.xyz, count_on(n, borrowed.device))
     return give(plan.labels[:n], borrowed.family)

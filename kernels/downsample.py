@@ -12,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from .arguments import real, whole
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .parts import parts_for
@@ -298,8 +299,8 @@ class VoxelDownsample:
         """Checks the numbers and makes the workspace."""
         if not (self.voxel_size > 0 and math.isfinite(self.voxel_size)):
             raise ValueError(f"voxel_size must be > 0 m and finite, not {self.voxel_size}")
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 and below 2³¹, not {self.capacity}")
         if self.mode not in _MODES:
             raise ValueError(f"mode must be 'centroid', 'first' or 'random', not {self.mode!r}")
         if self.method not in ("auto", "in_order", "shared"):
@@ -412,9 +413,9 @@ def voxel_downsample(points: Any, voxel_size: float, mode: str = "centroid", *, 
     n = len(borrowed)
     plan = plan_for(
         VoxelDownsample,
-        voxel_size=float(voxel_size),
+        voxel_size=real(voxel_size, "voxel_size"),
         mode=mode,
-        seed=int(seed) if mode == "random" else 0,
+        seed=whole(seed, "seed", bits=64) if mode == "random" else 0,
         capacity=capacity_for(n),
         device=borrowed.device,
     )

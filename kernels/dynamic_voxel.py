@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals, table
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import borrow_points, count_on, give
 from .parts import packed_parts, part_start, parts_for
@@ -219,8 +220,8 @@ class DynamicVoxelize:
         """Checks the numbers and makes the workspace."""
         grid = grid_of(self.voxel_size, self.point_range)
         for name, least in (("columns", 3), ("capacity", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+            if not least <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least {least} and below 2³¹, not {getattr(self, name)}")
         if self.method not in ("auto", "in_order", "sort"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'sort', not {self.method!r}")
         if self.parts is not None and self.parts < 1:
@@ -330,10 +331,10 @@ def dynamic_voxelize(points: Any, voxel_size: float | Sequence[float], point_ran
         ValueError: A shape or a number does not fit; the message says which.
     """
     borrowed = borrow_points(points)
-    edges = np.asarray(voxel_size, np.float64).ravel()
+    edges = table(voxel_size, "voxel_size").ravel()
     if edges.size not in (1, 3):
         raise ValueError(f"voxel_size must be one number or three, not {edges.size}")
-    limits = tuple(float(limit) for limit in point_range)
+    limits = reals(point_range, "point_range")
     if len(limits) != 6:
         raise ValueError(f"point_range must have six numbers, xmin ymin zmin xmax ymax zmax, not {len(limits)}")
     n, columns = borrowed.table.shape

@@ -131,7 +131,7 @@ def pack_part(
     dropped_out: wp.array(dtype=wp.int32),
 ):
     """Packs one of the parts that the points are cut into, behind what the parts before it keep."""
-    n = wp.min(count_in[0], xyz_in.shape[0])
+    n = wp.max(wp.min(count_in[0], xyz_in.shape[0]), 0)
     place = int(0)
     if tallied != 0:
         for before in range(part):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals
 from .device import DEFAULT_DEVICE, resolve_device
 from .filter_parts import EGO, KEPT, NON_FINITE, OUT_OF_RANGE, Limits, pack_part
 from .interop import Points, adopt, borrow_points, count_on, give
@@ -138,8 +139,8 @@ class PointFilter:
     """How many went because not finite, out of range, in the ego box; the first that holds; shape (3,), int32."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         inside = _EVERYWHERE if self.point_range is None else _checked_box("point_range", self.point_range)
         ego = _NOWHERE if self.ego_box is None else _checked_box("ego_box", self.ego_box)
         limits = Limits()
@@ -244,7 +245,7 @@ class PointFilter:
 
 def _checked_box(name: str, box: Sequence[float]) -> tuple[float, ...]:
     """The six numbers of a box, low corner first."""
-    numbers = tuple(float(number) for number in box)
+    numbers = reals(box, name)
     if len(numbers) != 6 or not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
         raise ValueError(f"{name} must be xmin ymin zmin xmax ymax zmax with min < max, not {box}")
     return numbers

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, whole
 from .cell_columns import CellColumns
 from .cell_pairs import Radius, unite
 from .cell_table import CellTable, cell_at
@@ -92,8 +93,8 @@ class GridCluster:
         if self.connectivity not in _AXES:
             raise ValueError(f"connectivity must be 6, 18 or 26, not {self.connectivity}")
         for name in ("min_size", "capacity"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if self.method not in ("auto", "in_order", "shared"):
             raise ValueError(f"method must be 'auto', 'in_order' or 'shared', not {self.method!r}")
         device = resolve_device(self.device)
@@ -201,9 +202,9 @@ def grid_cluster(points: Any, cell: float, min_size: int = 1, connectivity: int 
     n = len(borrowed)
     plan = plan_for(
         GridCluster,
-        cell=float(cell),
-        min_size=int(min_size),
-        connectivity=int(connectivity),
+        cell=real(cell, "cell"),
+        min_size=whole(min_size, "min_size"),
+        connectivity=whole(connectivity, "connectivity"),
         capacity=capacity_for(n),
         device=borrowed.device,
     )

@@ -10,6 +10,7 @@ surface of its cell: strictly where something stands on the cell, loosely where 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, reals
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .ground_parts import GroundLimits, judge_cells_part, judge_points_part
@@ -275,16 +277,20 @@ class GroundSegment:
     """z of the ground in the middle of each square, row = x, column = y, float32; filled by `launch_elevation`."""
 
     def __post_init__(self):
-        if not self.cell_size > 0:
-            raise ValueError(f"cell_size must be > 0 m, not {self.cell_size}")
+        if not (self.cell_size > 0 and math.isfinite(self.cell_size)):
+            raise ValueError(f"cell_size must be > 0 m and finite, not {self.cell_size}")
         xmin, ymin, xmax, ymax = self.grid_range
-        if not (xmin < xmax and ymin < ymax):
-            raise ValueError(f"grid_range must be xmin ymin xmax ymax with min < max, not {self.grid_range}")
+        if not (xmin < xmax and ymin < ymax and all(math.isfinite(limit) for limit in self.grid_range)):
+            raise ValueError(f"grid_range must be xmin ymin xmax ymax, finite, with min < max, not {self.grid_range}")
         fit = GroundPlane(
             capacity=self.capacity, sensor_height=self.sensor_height, device=self.device, method=self.method
         )
         device = resolve_device(self.device)
         squares = (max(1, round((xmax - xmin) / self.cell_size)), max(1, round((ymax - ymin) / self.cell_size)))
+        if squares[0] * squares[1] >= 2**31:
+            raise ValueError(
+                f"grid_range has {squares[0]} × {squares[1]} squares, 2³¹ or more; choose a larger cell_size"
+            )
 
         def keep(name: str, value: Any) -> None:
             object.__setattr__(self, name, value)
@@ -394,7 +400,7 @@ def segment_ground(points: Any, *, sensor_height: float | None = None, backend: 
     """
     borrowed = borrow_points(points)
     n = len(borrowed)
-    height = None if sensor_height is None else float(sensor_height)
+    height = None if sensor_height is None else real(sensor_height, "sensor_height")
     if uses_taichi(backend):
         from .taichi import ground as in_taichi
 
@@ -442,15 +448,15 @@ def elevation_grid(
         ValueError: A shape or a number does not fit; the message says which.
     """
     borrowed = borrow_points(points)
-    limits = tuple(float(limit) for limit in grid_range)
+    limits = reals(grid_range, "grid_range")
     if len(limits) != 4:
         raise ValueError(f"grid_range must have four numbers, xmin ymin xmax ymax, not {len(limits)}")
     plan = plan_for(
         GroundSegment,
         capacity=capacity_for(len(borrowed)),
-        sensor_height=None if sensor_height is None else float(sensor_height),
+        sensor_height=None if sensor_height is None else real(sensor_height, "sensor_height"),
         grid_range=limits,
-        cell_size=float(cell_size),
+        cell_size=real(cell_size, "cell_size"),
         device=borrowed.device,
     )
     plan.launch(borrowed.xyz, count_on(len(borrowed), borrowed.device))

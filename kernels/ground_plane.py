@@ -347,8 +347,8 @@ class GroundPlane:
     """Distance of the frame's origin from the plane [m], shape (1,), float32."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         if self.sensor_height is not None and not math.isfinite(self.sensor_height):
             raise ValueError(f"sensor_height must be finite [m] or None, not {self.sensor_height}")
         device = resolve_device(self.device)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals, table, wholes
 from .camera import Camera, borrow_image, camera_model, image_point, is_in_image
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, family_of, give
@@ -189,8 +190,8 @@ class InversePerspective:
             raise ValueError(
                 f"shape must be rows and columns, at least 1 each, at most 2³⁰ numbers in all, not {self.shape}"
             )
-        if self.channels < 1:
-            raise ValueError(f"channels must be at least 1, not {self.channels}")
+        if not 1 <= self.channels < 2**31:
+            raise ValueError(f"channels must be at least 1 and below 2³¹, not {self.channels}")
         if len(self.plane) != 4 or not all(map(math.isfinite, self.plane)) or self.plane[2] == 0:
             raise ValueError(f"plane must be a b c d, finite, with c other than 0, not {self.plane}")
         if self.dtype not in (wp.uint8, wp.float32):
@@ -326,19 +327,20 @@ def inverse_perspective(
     """
     family = family_of(image, "image")
     picture, owner = borrow_image(image)
-    pose = np.asarray(vehicle_from_camera, np.float64)
+    pose = table(vehicle_from_camera, "vehicle_from_camera")
     plan = plan_for(
         InversePerspective,
         image_size=(picture.shape[1], picture.shape[0]),
-        bev_range=tuple(float(limit) for limit in bev_range),
-        shape=tuple(int(length) for length in shape),
+        bev_range=reals(bev_range, "bev_range"),
+        shape=wholes(shape, "shape"),
         channels=picture.shape[2],
-        plane=tuple(float(number) for number in plane),
+        plane=reals(plane, "plane"),
         dtype=picture.dtype,
         device=family.device,
     )
     # Cameras and planes seldom move: the pixels found last time mostly do.
-    drawn_for = repr((pose.tolist(), np.asarray(intrinsics).tolist(), None if distortion is None else [*distortion]))
+    lens = None if distortion is None else table(distortion, "distortion").tolist()
+    drawn_for = repr((pose.tolist(), table(intrinsics, "intrinsics").tolist(), lens))
     if drawn_for != plan._drawn_for:
         if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose)) < 1e-9:
             raise ValueError(f"vehicle_from_camera must be a finite rigid transform of shape (4, 4), not {pose}")

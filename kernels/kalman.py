@@ -12,6 +12,7 @@ is the textbook's correction without inverting a matrix, and a number that was n
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -268,8 +269,8 @@ class KalmanFilter:
     """Out of `update`: logarithm of each measurement's probability density, shape (capacity,)."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 and below 2³¹, not {self.capacity}")
         size = _state_size(self.model)
         if self.dtype not in _DTYPES:
             raise ValueError(f"dtype must be one of {', '.join(_DTYPES)}, not {self.dtype!r}")
@@ -396,6 +397,8 @@ def kalman_predict(
     """
     tracks = _Tracks(state, covariance, model, active)
     if isinstance(dt, float | int):
+        if not math.isfinite(dt):
+            raise ValueError(f"dt must be a finite number of seconds, not {dt}")
         steps = wp.array([dt], dtype=tracks.dtype, device=tracks.state.device)
     else:
         steps = tracks.view(dt, tracks.dtype, (tracks.n,), "dt")

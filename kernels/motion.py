@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow, borrow_points, count_on, family_of, give
 from .motion_parts import Segment, move_part
@@ -106,10 +107,10 @@ class MotionCompensation:
     pose."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
-        if self.max_poses < 2:
-            raise ValueError(f"max_poses must be at least 2, not {self.max_poses}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
+        if not 2 <= self.max_poses < 2**31:
+            raise ValueError(f"max_poses must be at least 2 and below 2³¹, not {self.max_poses}")
         device = resolve_device(self.device)
         object.__setattr__(self, "device", device)
 
@@ -137,7 +138,7 @@ class MotionCompensation:
             ValueError: A shape or a number does not fit; the message says which.
         """
         stamps = np.asarray(times, np.float64)
-        segments = _segments_of(_checked_poses(poses), stamps, float(reference_time))
+        segments = _segments_of(_checked_poses(poses), stamps, real(reference_time, "reference_time"))
         if len(stamps) > self.max_poses:
             raise ValueError(f"poses are {len(stamps)}, more than the plan's max_poses of {self.max_poses}")
         self._put("_times", stamps)

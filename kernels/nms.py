@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from .arguments import real, whole
 from .box_overlap import SHAPE_ROWS, common_area, find_near, shape_boxes
 from .device import DEFAULT_DEVICE, module_apart, resolve_device
 from .interop import borrow, count_on, family_of, give
@@ -162,8 +163,10 @@ class RotatedNms:
     def __post_init__(self):
         if not 0.0 <= self.threshold <= 1.0:
             raise ValueError(f"threshold must be in [0, 1], not {self.threshold}")
-        if self.capacity < 1 or self.max_output < 1:
-            raise ValueError(f"capacity and max_output must be at least 1, not {self.capacity} and {self.max_output}")
+        if not (1 <= self.capacity < 2**31 and 1 <= self.max_output < 2**31):
+            raise ValueError(
+                f"capacity and max_output must be at least 1 and below 2³¹, not {self.capacity} and {self.max_output}"
+            )
         device = resolve_device(self.device)
 
         def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
@@ -225,15 +228,17 @@ def rotated_nms(boxes: Any, scores: Any, threshold: float, max_output: int | Non
         Indices into `boxes`, best score first, equal scores in the order of the input; int32, the family of `boxes`.
 
     Raises:
-        ValueError: Shapes that do not fit, or a threshold outside [0, 1].
+        ValueError: Shapes that do not fit, a threshold outside [0, 1], or a negative `max_output`.
     """
+    if max_output is not None and whole(max_output, "max_output") < 0:
+        raise ValueError(f"max_output must be at least 0, not {max_output}")
     family = family_of(boxes, "boxes")
     borrowed, owner = borrow(boxes, wp.float32, (None, 7), "boxes")
     n = borrowed.shape[0]
     ranks, scores_owner = borrow(scores, wp.float32, (n,), "scores")
     capacity = capacity_for(n)
     plan = plan_for(
-        RotatedNms, capacity=capacity, threshold=float(threshold), max_output=capacity, device=family.device
+        RotatedNms, capacity=capacity, threshold=real(threshold, "threshold"), max_output=capacity, device=family.device
     )
     kept = 0
     if n:
@@ -241,7 +246,7 @@ def rotated_nms(boxes: Any, scores: Any, threshold: float, max_output: int | Non
         kept = int(plan.keep_count.numpy()[0])
     del owner, scores_owner
     if max_output is not None:
-        kept = min(kept, max_output)
+        kept = min(kept, int(max_output))
     if kept == 0:
         return give(wp.zeros(0, dtype=wp.int32, device=family.device), family)
     return give(plan.keep[:kept], family)

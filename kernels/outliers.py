@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from .arguments import real, whole
 from .device import DEFAULT_DEVICE
 from .interop import borrow_points, count_on, give
 from .leaf_lanes import Eight, lay_out, parts_for
@@ -196,8 +197,8 @@ class RadiusOutliers:
     def __post_init__(self):
         if not (self.radius > 0 and 1e-15 < self.radius < 1e15):
             raise ValueError(f"radius must be a positive number of metres, not {self.radius}")
-        if self.min_neighbors < 1:
-            raise ValueError(f"min_neighbors must be at least 1, not {self.min_neighbors}")
+        if not 1 <= self.min_neighbors < 2**31:
+            raise ValueError(f"min_neighbors must be at least 1 and below 2³¹, not {self.min_neighbors}")
         tree = PointTree(capacity=self.capacity, device=self.device)
         squared = self.radius * self.radius
         reach = Reach()
@@ -307,7 +308,9 @@ def radius_outliers(points: Any, radius: float, min_neighbors: int = 2) -> Any:
         TypeError: `points` is not a floating array.
         ValueError: A shape or a number does not fit; the message says which.
     """
-    return _outliers(points, RadiusOutliers, radius=float(radius), min_neighbors=int(min_neighbors))
+    return _outliers(
+        points, RadiusOutliers, radius=real(radius, "radius"), min_neighbors=whole(min_neighbors, "min_neighbors")
+    )
 
 
 def statistical_outliers(points: Any, neighbors: int = 20, std_ratio: float = 2.0) -> Any:
@@ -330,4 +333,6 @@ def statistical_outliers(points: Any, neighbors: int = 20, std_ratio: float = 2.
         TypeError: `points` is not a floating array.
         ValueError: A shape or a number does not fit; the message says which.
     """
-    return _outliers(points, StatisticalOutliers, neighbors=int(neighbors), std_ratio=float(std_ratio))
+    return _outliers(
+        points, StatisticalOutliers, neighbors=whole(neighbors, "neighbors"), std_ratio=real(std_ratio, "std_ratio")
+    )

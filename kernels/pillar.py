@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, reals
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
 from .parts import parts_for, run_parts
@@ -208,8 +209,8 @@ class PillarGrid:
             raise ValueError(
                 f"point_range must be xmin ymin zmin xmax ymax zmax, finite, with min < max, not {self.point_range}"
             )
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         if (high[2] - low[2]) * 1000.0 >= 2**31:
             raise ValueError(f"point_range must be less than 2³¹ mm high, not {low[2]} … {high[2]} m")
         every = pillar_channels()
@@ -344,21 +345,24 @@ def pillarize(
         Shape (C, H, W), float32, of the family of `points`: channels of `pillar_channels`, rows along y, columns
         along x.
     """
+    height = real(sensor_height, "sensor_height")
+    if not math.isfinite(height):
+        raise ValueError(f"sensor_height must be a finite number of metres, not {sensor_height}")
     borrowed = borrow_points(points)
     plan = plan_for(
         PillarGrid,
-        point_range=tuple(float(v) for v in point_range),
-        cell=float(cell),
+        point_range=reals(point_range, "point_range"),
+        cell=real(cell, "cell"),
         capacity=capacity_for(len(borrowed)),
         device=borrowed.device,
     )
     count = count_on(len(borrowed), borrowed.device)
     if borrowed.device != DEFAULT_DEVICE:
-        plan.launch(borrowed.xyz, count, sensor_height)
+        plan.launch(borrowed.xyz, count, height)
         return give(plan._grid, borrowed.family)
     # Straight onto an array of its own: the grid is far larger than the cloud.
     host = np.empty(plan.shape[1:], np.float32)
-    plan._height.fill_(float(sensor_height))
+    plan._height.fill_(height)
     grid = wp.array(host, dtype=wp.float32, copy=False, device=DEFAULT_DEVICE)
     plan._draw(borrowed.xyz, count, plan._height, grid, [None, None])
     return adopt(host, borrowed.family)

@@ -209,7 +209,7 @@ def _key_points(
 ):
     """The place of each point along the curve, for the whole capacity, so that the sort finds no leftovers."""
     begin = wp.tid() * block
-    n = wp.min(count_in[0], xyz_in.shape[0])
+    n = wp.max(wp.min(count_in[0], xyz_in.shape[0]), 0)
     _key_block(begin, wp.min(begin + block, capacity), xyz_in, n, width, key_out, index_out)
 
 

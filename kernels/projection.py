@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, whole, wholes
 from .camera import Camera, borrow_image, camera_model, image_point, is_in_image
 from .device import DEFAULT_DEVICE, resolve_device
 from .image_values import paint
@@ -124,11 +125,11 @@ class PointProjection:
     """Out: whether a point is in the image and not hidden, shape (capacity,), bool."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         if len(self.image_size) != 2 or not 1 <= min(self.image_size) <= max(self.image_size) <= 2**20:
             raise ValueError(f"image_size must be width and height, 1 to 2²⁰ pixels each, not {self.image_size}")
-        if self.occlusion_cell < 0:
+        if not 0 <= self.occlusion_cell < 2**31:
             raise ValueError(f"occlusion_cell must be 0 or a number of pixels, not {self.occlusion_cell}")
         if not (self.occlusion_margin >= 0 and math.isfinite(self.occlusion_margin)):
             raise ValueError(f"occlusion_margin must be 0 or more metres, not {self.occlusion_margin}")
@@ -211,8 +212,8 @@ class PointPainting:
     """Out: what the image says at each point, zero where it is not visible, shape (capacity, channels), float32."""
 
     def __post_init__(self):
-        if self.channels < 1:
-            raise ValueError(f"channels must be at least 1, not {self.channels}")
+        if not 1 <= self.channels < 2**31:
+            raise ValueError(f"channels must be at least 1 and below 2³¹, not {self.channels}")
         if self.method not in _METHODS:
             raise ValueError(f"method must be 'bilinear' or 'nearest', not {self.method!r}")
         shape = (self.projection.capacity, self.channels)
@@ -283,9 +284,9 @@ def _projection_plan(borrowed: Points, image_size: Sequence[int], cell: int, mar
     return plan_for(
         PointProjection,
         capacity=capacity_for(len(borrowed)),
-        image_size=tuple(int(length) for length in image_size),
-        occlusion_cell=int(cell),
-        occlusion_margin=float(margin),
+        image_size=wholes(image_size, "image_size"),
+        occlusion_cell=whole(cell, "occlusion_cell"),
+        occlusion_margin=real(margin, "occlusion_margin"),
         device=borrowed.device,
     )
 

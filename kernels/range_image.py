@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals, wholes
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -250,9 +251,9 @@ def range_image(
     plan = plan_for(
         RangeProjection,
         capacity=capacity_for(n),
-        shape=tuple(int(length) for length in shape),
-        vertical_fov=tuple(float(angle) for angle in vertical_fov),
-        elevations=None if elevations is None else tuple(float(angle) for angle in elevations),
+        shape=wholes(shape, "shape"),
+        vertical_fov=reals(vertical_fov, "vertical_fov"),
+        elevations=None if elevations is None else reals(elevations, "elevations"),
         device=borrowed.device,
     )
     count = count_on(n, borrowed.device)

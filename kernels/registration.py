@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, table, whole
 from .device import DEFAULT_DEVICE, resolve_device
 from .downsample import VoxelDownsample
 from .gauss_newton import COUNT, SQUARES, Step, Sums, narrowed, solve, stepped, stretch_of, terms_of
@@ -307,8 +308,8 @@ class ScanRegistration:
 
     def __post_init__(self):
         for name in ("capacity", "max_iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance must be ≥ 0, not {self.tolerance}")
         if self.method not in ("auto", "in_order", "shared"):
@@ -437,9 +438,9 @@ def register(
         ValueError: A shape or a number does not fit, or the devices differ; the message says which.
     """
     for name, value in (("max_distance", max_distance), ("robust_scale", robust_scale)):
-        if not (value > 0 and math.isfinite(value)):
+        if not (real(value, name) > 0 and math.isfinite(value)):
             raise ValueError(f"{name} must be > 0 m and finite, not {value}")
-    guess = np.eye(4) if initial is None else np.asarray(initial, np.float64)
+    guess = np.eye(4) if initial is None else table(initial, "initial")
     if guess.shape != (4, 4) or not np.isfinite(guess).all():
         raise ValueError(f"initial must be a finite matrix of shape (4, 4), not of shape {guess.shape}")
     moving, fixed = borrow_points(source, "source"), borrow_points(target, "target")
@@ -448,14 +449,18 @@ def register(
         raise ValueError(f"source is on {device} and target on {fixed.device}; both must be on one device")
     n, m = len(moving), len(fixed)
     voxel_map = plan_for(
-        VoxelMap, voxel_size=float(voxel_size), capacity=capacity_for(m), max_voxels=capacity_for(m), device=device
+        VoxelMap,
+        voxel_size=real(voxel_size, "voxel_size"),
+        capacity=capacity_for(m),
+        max_voxels=capacity_for(m),
+        device=device,
     )
     thinned = plan_for(VoxelDownsample, voxel_size=0.5 * float(voxel_size), capacity=capacity_for(n), device=device)
     plan = plan_for(
         ScanRegistration,
         capacity=capacity_for(n),
-        max_iterations=int(max_iterations),
-        tolerance=float(tolerance),
+        max_iterations=whole(max_iterations, "max_iterations"),
+        tolerance=real(tolerance, "tolerance"),
         device=device,
     )
     voxel_map.clear()

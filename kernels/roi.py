@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import real, reals, several, table
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
 from .plan import capacity_for, plan_for
@@ -230,8 +231,8 @@ class PolygonMask:
 
     def __post_init__(self):
         for name in ("capacity", "max_vertices"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if not (self.cell > 0 and math.isfinite(self.cell)):
             raise ValueError(f"cell must be a positive number of metres, not {self.cell}")
         limits = self.point_range
@@ -321,8 +322,10 @@ class PolygonMask:
 
 def _rings(polygon: Any) -> Iterator[np.ndarray]:
     """The rings of a polygon: it is one itself, or a sequence of them."""
+    if not isinstance(polygon, np.ndarray):
+        polygon = several(polygon, "polygons")
     for ring in [polygon] if len(polygon) and np.ndim(polygon[0]) == 1 else polygon:
-        ring = np.asarray(ring, np.float64)
+        ring = table(ring, "polygons")
         if ring.ndim != 2 or ring.shape[1] != 2 or len(ring) < 3:
             raise ValueError(f"polygons must be of rings of shape (k, 2), 3 vertices or more, not {ring.shape}")
         if not np.isfinite(ring).all():
@@ -334,7 +337,7 @@ def _edges_of(polygons: Sequence[Any]) -> np.ndarray:
     """From each vertex to the next of its ring, and the number of its polygon, shape (e, 5)."""
     edges = [
         np.column_stack([ring, np.roll(ring, -1, axis=0), np.full(len(ring), number)])
-        for number, polygon in enumerate(polygons)
+        for number, polygon in enumerate(several(polygons, "polygons"))
         for ring in _rings(polygon)
     ]
     return np.concatenate(edges) if edges else np.zeros((0, 5))
@@ -367,8 +370,8 @@ def in_polygons(
     plan = plan_for(
         PolygonMask,
         capacity=1 if borrowed.device == DEFAULT_DEVICE else capacity_for(n),
-        point_range=tuple(float(limit) for limit in point_range),
-        cell=float(cell),
+        point_range=reals(point_range, "point_range"),
+        cell=real(cell, "cell"),
         exact=bool(exact),
         max_vertices=capacity_for(len(edges)),
         device=borrowed.device,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arguments import reals, table, whole
 from .backend import uses_taichi
 from .device import DEFAULT_DEVICE, resolve_device
 from .interop import adopt, borrow_points, count_on, give
@@ -269,8 +270,8 @@ class Voxelize:
         """Checks the numbers and makes the workspace."""
         grid = grid_of(self.voxel_size, self.point_range)
         for name, least in (("columns", 3), ("max_points", 1), ("max_voxels", 1), ("capacity", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+            if not least <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least {least} and below 2³¹, not {getattr(self, name)}")
         size = self.max_voxels * self.max_points * self.columns
         if size >= 1 << 31:
             raise ValueError(
@@ -429,25 +430,26 @@ def voxelize(
         ImportError: The backend is Taichi, which is not installed.
     """
     borrowed = borrow_points(points)
-    edges = np.asarray(voxel_size, np.float64).ravel()
+    edges = table(voxel_size, "voxel_size").ravel()
     if edges.size not in (1, 3):
         raise ValueError(f"voxel_size must be one number or three, not {edges.size}")
     size = tuple(float(edge) for edge in np.broadcast_to(edges, 3))
-    limits = tuple(float(limit) for limit in point_range)
+    limits = reals(point_range, "point_range")
+    max_points, max_voxels = whole(max_points, "max_points"), whole(max_voxels, "max_voxels")
     if len(limits) != 6:
         raise ValueError(f"point_range must have six numbers, xmin ymin zmin xmax ymax zmax, not {len(limits)}")
     if uses_taichi(backend):
         from .taichi import voxel as in_taichi
 
-        return in_taichi.voxelize(borrowed, size, limits, int(max_points), int(max_voxels))
+        return in_taichi.voxelize(borrowed, size, limits, max_points, max_voxels)
     n, columns = borrowed.table.shape
     plan = plan_for(
         Voxelize,
         voxel_size=size,
         point_range=limits,
         columns=columns,
-        max_points=int(max_points),
-        max_voxels=int(max_voxels),
+        max_points=max_points,
+        max_voxels=max_voxels,
         capacity=capacity_for(n),
         device=borrowed.device,
     )

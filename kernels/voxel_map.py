@@ -392,8 +392,8 @@ class VoxelMap:
         if not (self.voxel_size > 0 and math.isfinite(self.voxel_size)):
             raise ValueError(f"voxel_size must be > 0 m and finite, not {self.voxel_size}")
         for name in ("capacity", "max_voxels"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         if not 1 <= self.max_points <= _MOST_POINTS:
             raise ValueError(f"max_points must be 1 to {_MOST_POINTS}, not {self.max_points}")
         if self.max_voxels * self.max_points >= 1 << 31:

@@ -169,8 +169,8 @@ def bev(points: Points, point_range: Sequence[float], shape: Sequence[int]) -> A
     plan = plan_for(
         BevMaps,
         capacity=capacity_for(len(points)),
-        point_range=tuple(float(limit) for limit in point_range),
-        shape=tuple(int(length) for length in shape),
+        point_range=point_range,
+        shape=shape,
         device=device,
     )
     maps = np.zeros((3, *plan.shape), np.float32)

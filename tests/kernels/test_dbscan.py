@@ -190,7 +190,7 @@ def test_strided_read_only_and_float64_input_gives_the_same():
         ((0.0, 3), "eps must be a positive number"),
         ((float("nan"), 3), "eps must be a positive number"),
         ((float("inf"), 3), "eps must be a positive number"),
-        ((0.5, 0), "min_points must be at least 1, not 0"),
+        ((0.5, 0), "min_points must be at least 1 and below 2³¹, not 0"),
     ],
 )
 def test_a_wrong_argument_is_refused_by_name(arguments, message):
