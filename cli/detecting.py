@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 from pathlib import Path
 from typing import Annotated
 
@@ -84,6 +86,15 @@ heads = typer.Typer(help="Detection heads: import, look at, quantise.", no_args_
 commands.add_typer(heads, name="head")
 
 
+_IMPORTERS = {  # kind: its module, which has a function `import_KIND`
+    "pointpillars": "pointpillars",
+    "fcn3d": "fcn3d",
+    "yolox": "image_detectors",
+    "fastestdet": "image_detectors",
+    "twinlitenet": "twinlitenet",
+}
+
+
 @heads.command("import")
 def import_head(
     kind: Annotated[str, typer.Argument(help="pointpillars, fcn3d, yolox, fastestdet or twinlitenet.")],
@@ -100,27 +111,21 @@ def import_head(
     """
     from ..errors import ConfigError
 
+    if kind not in _IMPORTERS:
+        raise ConfigError(f"no importer {kind!r}; there are: {', '.join(_IMPORTERS)}")
     if config is not None and kind != "pointpillars":
         raise typer.BadParameter("only pointpillars takes a configuration", param_hint="--config")
-    if kind == "pointpillars":
-        from ..models.importers.pointpillars import PointPillarsSpec, import_pointpillars
-
-        spec = PointPillarsSpec.read_file(config) if config is not None else None
-        card = import_pointpillars(checkpoint, out, spec=spec)
-    elif kind == "fcn3d":
-        from ..models.importers.fcn3d import import_fcn3d
-
-        card = import_fcn3d(checkpoint, out)
-    elif kind == "twinlitenet":
-        from ..models.importers.twinlitenet import import_twinlitenet
-
-        card = import_twinlitenet(checkpoint, out)
-    elif kind in ("yolox", "fastestdet"):
-        from ..models.importers.image_detectors import import_fastestdet, import_yolox
-
-        card = (import_yolox if kind == "yolox" else import_fastestdet)(checkpoint, out)
-    else:
-        raise ConfigError(f"no importer {kind!r}; there are: pointpillars, fcn3d, yolox, fastestdet, twinlitenet")
+    try:
+        module = importlib.import_module(f"..models.importers.{_IMPORTERS[kind]}", __package__)
+        importer = getattr(module, f"import_{kind}")
+        if config is not None:
+            importer = functools.partial(importer, spec=module.PointPillarsSpec.read_file(config))
+        card = importer(checkpoint, out)
+    except ImportError as error:
+        needed = error.name or "torch"
+        raise ConfigError(
+            f"to import a head takes {needed}, which is not installed: pip install 'warploom[torch]'"
+        ) from error
     typer.echo(f"{card}")
 
 
@@ -128,7 +133,10 @@ def import_head(
 def show_head(
     card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
 ) -> None:
-    """Check a card and its model, and tell what it says."""
+    """Check a card and its model, and tell what it says.
+
+    Example: `warploom head show heads/pointpillars.yaml`
+    """
     import yaml
 
     from ..models.card import DEFAULT_CARD
@@ -145,7 +153,10 @@ def quantize(
     out: Annotated[Path, typer.Option(help="Folder for the ONNX file and the card.")] = Path("heads"),
     frames: Annotated[int, typer.Option(min=1, help="Simulated scenes to calibrate with.")] = 12,
 ) -> None:
-    """Write a variant of a head in eight bits, calibrated on simulated scenes; measure it with `warploom eval`."""
+    """Write a variant of a head in eight bits, calibrated on simulated scenes; measure it with `warploom eval`.
+
+    Example: `warploom head quantize --out heads`
+    """
     from ..components.evaluation.detection_frames import evaluation_frames
     from ..models.card import DEFAULT_CARD
     from ..models.quantization import quantize_head

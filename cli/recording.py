@@ -36,7 +36,7 @@ def record(
 ) -> None:
     """Perceive a source and record every topic, lossless, for `play` and `replay`.
 
-    Example: `warploom record --source sim:street?seed=7 --out street.mcap`
+    Example: `warploom record --source "sim:street?seed=7" --out street.mcap`
     """
     from ..components.recording import record_source
 

@@ -47,7 +47,7 @@ def demo(
 @commands.command()
 def run(
     source: Annotated[
-        str, typer.Option("--source", help="kitti:DIR, sim:street?seed=7, or a scan or a folder of scans.")
+        str, typer.Option("--source", help="kitti:DIR, sim:street?seed=7, mcap:FILE, or a scan or a folder of scans.")
     ],
     profile: Profile = "cpu",
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,

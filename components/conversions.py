@@ -46,8 +46,10 @@ def to_torch(cloud: PointCloud, *names: str) -> torch.Tensor | dict[str, torch.T
         ValueError: There is no such field; those named are of several types; or as of `PointCloud.to_array`.
         ImportError: torch is not installed.
     """
-    import torch
-
+    try:
+        import torch
+    except ImportError as error:
+        raise ImportError("to_torch needs torch, which is not installed: pip install 'warploom[torch]'") from error
     points = cloud.to_array().reshape(-1)
     if names:
         return torch.from_dlpack(_exportable(_side_by_side(points, names)))
@@ -110,7 +112,10 @@ def to_open3d(cloud: PointCloud) -> open3d.t.geometry.PointCloud:
         ValueError: There is no x, y or z; or as of `PointCloud.to_array`.
         ImportError: Open3D is not installed.
     """
-    import open3d as o3d  # pyright: ignore[reportMissingImports]
+    try:
+        import open3d as o3d  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError("to_open3d needs Open3D, which is not installed: pip install open3d") from error
 
     points = cloud.to_array().reshape(-1)
     xyz = np.ascontiguousarray(_side_by_side(points, _POSITIONS), np.float32)

@@ -2,7 +2,7 @@
 
 Static quantisation (Jacob et al., CVPR 2018) by ONNX Runtime: weights per channel, activations by the range that all
 but one in a hundred thousand of them take on calibration frames: the few beyond would cost the others resolution. Needs
-the onnx package (`pip install onnx`).
+the onnx package (`pip install 'warploom[torch]'`).
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def quantize_head(
         from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
         from onnxruntime.quantization.shape_inference import quant_pre_process
     except ImportError as error:
-        raise ModelError(f"{card}: to quantise a head takes the onnx package: pip install onnx ({error})") from error
+        raise ModelError(
+            "to quantise a head takes onnx, which is not installed: pip install 'warploom[torch]'"
+        ) from error
     old, model = load_card(card)
     grid = PillarGrid(
         point_range=old.input.point_range,

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import pathlib
 import subprocess
 import sys
@@ -99,6 +100,31 @@ def test_bad_usage_says_what_and_ends_with_its_code(warploom, arguments, code, m
     assert message in " ".join(warploom(*arguments, expect=code).split())
 
 
+@pytest.mark.parametrize(("missing", "arguments"), [
+    ("torch", ["head", "import", "pointpillars", "x.pth"]),
+    ("torch", ["head", "import", "fcn3d", "x.npz"]),
+    ("torch", ["head", "import", "twinlitenet", "x.pth"]),
+    ("onnx", ["head", "quantize"]),
+    ("pytest", ["bench", "--filter", "voxelize"]),
+])  # fmt: skip
+def test_what_needs_an_extra_names_it(missing, arguments, tmp_path):
+    """In a process of its own, in which the library cannot be imported."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.machinery as machinery\n"
+        "find = machinery.PathFinder.find_spec\n"
+        "machinery.PathFinder.find_spec = staticmethod(\n"
+        f"    lambda name, *more: None if name.split('.')[0] == '{missing}' else find(name, *more)\n)\n"
+    )
+    run = subprocess.run(
+        [pathlib.Path(sys.executable).with_name("warploom"), *arguments],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)}, cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode == 2
+    assert "Traceback" not in run.stderr
+    extra = "bench" if missing == "pytest" else "torch"
+    assert f"{missing}, which is not installed: pip install 'warploom[{extra}]'" in run.stderr
+
+
 def test_a_recording_of_which_nothing_can_be_read_is_a_run_that_failed(warploom, tmp_path):
     (tmp_path / "scan.bin").write_bytes(b"seven b")
     assert "scan.bin" in warploom("run", "--source", "scan.bin", expect=1)
@@ -168,9 +194,21 @@ def test_info_tells_the_machine_or_what_a_file_holds(warploom, scans):
     assert "4" in warploom("info", scans)
 
 
-@pytest.mark.parametrize("command", ["demo", "run", "info", "check", "graph", "record", "play", "replay", "bench"])
-def test_every_command_has_help_with_an_example(warploom, command):
-    assert "Example:" in warploom(command, "--help")
+def commands(group, path=()):
+    """The words of every command of a group, of its groups too."""
+    for name, command in group.commands.items():
+        yield from commands(command, (*path, name)) if hasattr(command, "commands") else [(*path, name)]
+
+
+def test_every_command_has_help_with_an_example(warploom):
+    import typer
+
+    from warploom.cli import app
+
+    words = list(commands(typer.main.get_command(app)))
+    assert {("run",), ("eval", "detection"), ("head", "show")} < set(words)
+    for each in words:
+        assert "Example:" in warploom(*each, "--help"), each
 
 
 def test_the_example_of_an_own_processor_runs():

@@ -1,6 +1,7 @@
 """Clouds to torch, Open3D and PCD files, and back: what is shared is shared, and every value is the same."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -135,6 +136,16 @@ def test_positions_are_shared_with_open3d_unless_they_are_read_only(o3d):
     assert there.point.positions[3, 1].item() == 4.0
     freeze(cloud)
     np.testing.assert_array_equal(to_open3d(cloud).point.positions.numpy(), made)
+
+
+def test_a_library_that_is_not_there_is_named_with_how_to_get_it(monkeypatch):
+    cloud = PointCloud.from_array(np.zeros((3, 3), np.float32), Header(), ("x", "y", "z"))
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(ImportError, match=r"needs torch.*pip install 'warploom\[torch\]'"):
+        to_torch(cloud)
+    with pytest.raises(ImportError, match=r"needs Open3D.*pip install open3d"):
+        to_open3d(cloud)
 
 
 def test_the_older_class_of_open3d(o3d):
