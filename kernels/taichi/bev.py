@@ -111,8 +111,8 @@ class BevMaps:
     where there is no point."""
 
     def __post_init__(self):
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         low, high = self.point_range[:3], self.point_range[3:]
         if len(self.point_range) != 6 or not all(
             a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)

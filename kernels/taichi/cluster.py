@@ -352,8 +352,8 @@ class EuclideanCluster:
                 f"not {self.radius_per_metre}"
             )
         for name in ("min_size", "capacity"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least 1 and below 2³¹, not {getattr(self, name)}")
         start(self.device)
 
         def keep(name: str, value: Any) -> None:

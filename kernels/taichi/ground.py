@@ -429,8 +429,8 @@ class GroundSegment:
 
     def __post_init__(self):
         """Checks the numbers and makes the workspace."""
-        if self.capacity < 1:
-            raise ValueError(f"capacity must be at least 1 point, not {self.capacity}")
+        if not 1 <= self.capacity < 2**31:
+            raise ValueError(f"capacity must be at least 1 point and below 2³¹, not {self.capacity}")
         if self.sensor_height is not None and not np.isfinite(self.sensor_height):
             raise ValueError(f"sensor_height must be finite [m] or None, not {self.sensor_height}")
         start(self.device)

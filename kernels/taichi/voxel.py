@@ -260,8 +260,8 @@ class Voxelize:
         """Checks the numbers and makes the workspace."""
         grid = grid_of(self.voxel_size, self.point_range)
         for name, least in (("columns", 3), ("max_points", 1), ("max_voxels", 1), ("capacity", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, not {getattr(self, name)}")
+            if not least <= getattr(self, name) < 2**31:
+                raise ValueError(f"{name} must be at least {least} and below 2³¹, not {getattr(self, name)}")
         size = self.max_voxels * self.max_points * self.columns
         if size >= 1 << 31:
             raise ValueError(
