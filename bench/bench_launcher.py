@@ -6,6 +6,7 @@ import pty
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 
@@ -15,6 +16,8 @@ import pytest
 import yaml
 
 from warploom.bench.contest import peer, record_figure
+from warploom.dag.launch.control import connect
+from warploom.dag.launch.listening import listen
 
 COMMAND = "from warploom.cli import main; main()"
 IDLE_S = 5.0
@@ -45,25 +48,14 @@ pidfile={folder}/pid
 class Node:
     """A launched node whose events are read, or shown on a terminal."""
 
-    def __init__(self, folder, processes, *, terminal=False):
-        for number in range(processes):
-            (folder / f"m{number}.yaml").write_text(MODULE.format(name=f"m{number}"))
-        content = {
-            "node": "bench",
-            "processes": [
-                {"name": f"p{n}", "modules": [f"m{n}.yaml"], "back_off": {"first_s": 0.0}, "restarts": {"limit": 1000}}
-                for n in range(processes)
-            ],
-        }
-        path = folder / "bench.launch.yaml"
-        path.write_text(yaml.safe_dump(content))
+    def __init__(self, arguments, *, terminal=False):
         self.events = []
         self._changed = threading.Condition()
         self._terminal = pty.openpty() if terminal else None
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", COMMAND, "launch", str(path)],
+            [sys.executable, "-P", "-c", COMMAND, "launch", *arguments],
             stdout=subprocess.PIPE if self._terminal is None else self._terminal[1],
-            env={**os.environ, "WARPLOOM_RUN": str(folder / "run"), "TERM": "xterm"},
+            env={**os.environ, "TERM": "xterm"},
         )
         if self._terminal is not None:
             os.close(self._terminal[1])
@@ -93,7 +85,11 @@ class Node:
             return [one for one in self.events if wanted.items() <= one[1].items()]
 
         with self._changed:
-            assert self._changed.wait_for(lambda: len(found()) >= count, 120), self.events
+            over = time.monotonic() + 120
+            while len(found()) < count:
+                self._changed.wait(0.5)
+                assert self.process.poll() is None, f"it has ended: {self.events}"
+                assert time.monotonic() < over, self.events
         return found()[count - 1]
 
     def close(self):
@@ -107,17 +103,35 @@ class Node:
             self.process.stdout.close()
 
 
+def small_node(folder, processes):
+    """Writes the launch file of a node whose processes do next to nothing."""
+    for number in range(processes):
+        (folder / f"m{number}.yaml").write_text(MODULE.format(name=f"m{number}"))
+    keys = {"back_off": {"first_s": 0.0}, "restarts": {"limit": 1000}}
+    content = {
+        "node": "bench",
+        "processes": [{"name": f"p{n}", "modules": [f"m{n}.yaml"], **keys} for n in range(processes)],
+    }
+    path = folder / "bench.launch.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
 @pytest.fixture
-def node(tmp_path):
+def node(tmp_path, monkeypatch):
     nodes = []
 
-    def node(processes, **how):
-        nodes.append(Node(tmp_path, processes, **how))
+    def node(*launched, **how):
+        """Of so many small processes, or of what is named as on the command line."""
+        arguments = [small_node(tmp_path, launched[0])] if isinstance(launched[0], int) else launched
+        nodes.append(Node(arguments, **how))
         return nodes[-1]
 
-    yield node
-    for one in nodes:
-        one.close()
+    with tempfile.TemporaryDirectory(prefix="warploom-") as run:  # the path of a socket is short
+        monkeypatch.setenv("WARPLOOM_RUN", run)
+        yield node
+        for one in nodes:
+            one.close()
 
 
 def idle_share(pid, seconds=IDLE_S):
@@ -191,6 +205,72 @@ def bench_start_and_respawn(benchmark, node):
     note = f"median of {KILLS}"
     record_figure(benchmark, "death noticed after kill -9", np.median(told) * 1e3, "ms", note=note)
     record_figure(benchmark, "kill -9 to running again, back-off 0", np.median(back), "s", note=note)
+
+
+class Heard:
+    """When each commit of a topic of the only node was here."""
+
+    def __init__(self, topic):
+        self.times = []
+        self._topic = topic
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self):
+        name, client = connect(None)
+        with client:
+            for entry in listen(client, name, self._topic, "bench", 0.1, ends=False, past=False):
+                if self._stopping.is_set():
+                    return
+                if entry is not None:
+                    self.times.append(time.perf_counter())
+
+    def first_after(self, begin, least=1):
+        """The first time after another, once so many have come after it."""
+        end = time.perf_counter() + 120
+        while len(after := [one for one in self.times if one > begin]) < least:
+            assert time.perf_counter() < end, "nothing came"
+            time.sleep(0.01)
+        return after[0]
+
+    def stop(self):
+        """Listens no more."""
+        self._stopping.set()
+        self._thread.join()
+
+
+@pytest.mark.slow
+def bench_recovery_of_the_reference_node(benchmark, node):
+    """From kill -9 of the process that holds driver and perception to the next obstacles, heard in another process."""
+    one = node(*(f"--{key}={value}" for key, value in REFERENCE.items()))
+    begin = time.perf_counter()
+    one.wait_for(event="up")
+    heard = Heard("perception/obstacles")
+    first = heard.first_after(begin, least=20) - begin
+    running, served, obstacles = [], [], []
+
+    def kill():
+        number = len(running) + 1
+        process = "compute3d_sched"
+        pid = one.wait_for(number, event="state", process=process, state="running")[1]["pid"]
+        killed = time.perf_counter()
+        os.kill(pid, signal.SIGKILL)
+        running.append(one.wait_for(number + 1, event="state", process=process, state="running")[0] - killed)
+        # What had been committed before the kill may still arrive.
+        obstacles.append(heard.first_after(killed + min(0.5, running[-1]), least=10) - killed)
+        served.append(one.wait_for(number + 1, event="serving", process=process)[0] - killed)
+
+    benchmark.extra_info.update(kernel="launcher", on="reference node")
+    try:
+        benchmark.pedantic(kill, rounds=2)
+    finally:
+        heard.stop()
+    note = f"least of {len(obstacles)}; the simulator plays the hardware"
+    record_figure(benchmark, "reference node, from the command to obstacles", first, "s", note="kernels in the cache")
+    record_figure(benchmark, "reference node, kill -9 to running again", min(running), "s", note=note)
+    record_figure(benchmark, "reference node, kill -9 to serving", min(served), "s", note=note)
+    record_figure(benchmark, "reference node, kill -9 to obstacles", min(obstacles), "s", goal=6.0, note=note)
 
 
 def used_by(arguments, folder):
