@@ -48,7 +48,8 @@ def run_benchmarks(
     """Times ours beside the peers that are installed, prints tables, and writes JSON, report and plots into a folder.
 
     Args:
-        filters: Texts of which a benchmark's name is to have one; words of a text, apart by spaces, must all be in it.
+        filters: Texts of which a benchmark's name is to have one; words of a text, apart by spaces, must all be in it,
+            or be the topic of its file, such as `heads`.
             None takes all benchmarks.
         device: Where ours computes; the peers compute on the CPU.
         compare: The JSON of an earlier run, to stand beside this one.
@@ -101,6 +102,11 @@ def run_benchmarks(
     return measured
 
 
+def _topic(item: Any) -> str:
+    """What the file of a benchmark is about: `heads` of `bench_heads.py`."""
+    return item.path.stem.removeprefix("bench_")
+
+
 class _Selection:
     """A plugin of pytest: chooses the benchmarks, shows how far they are, and keeps what went wrong."""
 
@@ -111,12 +117,14 @@ class _Selection:
         self._progress = progress
         self._task = progress.add_task("benchmarks", total=None)
         self.names: list[str] = []
+        self.topics: list[str] = []
         self.selected = 0
         self.failures: list[str] = []
         self.skipped: dict[str, None] = {}
 
     def pytest_collection_modifyitems(self, config: Any, items: list[Any]) -> None:
         self.names = sorted({item.originalname.removeprefix("bench_") for item in items})
+        self.topics = sorted({_topic(item) for item in items})
         keep = [item for item in items if self._wants(item)]
         config.hook.pytest_deselected(items=[item for item in items if item not in keep])
         items[:] = keep
@@ -124,8 +132,8 @@ class _Selection:
         self._progress.update(self._task, total=len(items))
 
     def _wants(self, item: Any) -> bool:
-        name = item.name.lower()
-        if self._words and not any(all(word in name for word in words) for words in self._words):
+        name, topic = item.name.lower(), _topic(item)
+        if self._words and not any(all(word in name or word == topic for word in words) for words in self._words):
             return False
         parameters = item.callspec.params if hasattr(item, "callspec") else {}
         contender = parameters.get("contender")
@@ -180,7 +188,8 @@ def _measure(written: Path, filters: Sequence[str], device: str, quick: bool) ->
         raise BenchmarkError(f"pytest ended with {code!r}: {said.getvalue()[-2000:]}")
     if selection.selected == 0 and not selection.failures:
         raise ConfigError(
-            f"no benchmark's name has {' or '.join(map(repr, filters))}; there are {', '.join(selection.names)}"
+            f"no benchmark's name has {' or '.join(map(repr, filters))}; there are {', '.join(selection.names)}; "
+            f"a topic takes all of its own: {', '.join(selection.topics)}"
         )
     if code == pytest.ExitCode.INTERRUPTED and not selection.failures:
         raise KeyboardInterrupt

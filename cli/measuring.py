@@ -20,7 +20,11 @@ commands.add_typer(evaluation, name="eval")
 def bench(
     filters: Annotated[
         list[str] | None,
-        typer.Option("--filter", metavar="TEXT", help="Only benchmarks with this in their name; may be repeated."),
+        typer.Option(
+            "--filter",
+            metavar="TEXT",
+            help="Only benchmarks with this in their name, or of this topic; may be repeated.",
+        ),
     ] = None,
     device: Annotated[str, typer.Option("--device", help="Where ours computes: cpu, cuda:0 …")] = "cpu",
     compare: Annotated[

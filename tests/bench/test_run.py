@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import os
+import pathlib
+import re
 import subprocess
 import sys
 
@@ -48,6 +50,33 @@ def test_the_filters_choose_by_words_and_cpu_is_where_ours_computes(first):
         "bench_launch[launch-cpu]",
         "bench_launch[recorded-cpu]",
     }
+
+
+def test_every_filter_that_the_documents_name_chooses_something(bench):
+    """By collecting alone, which measures nothing."""
+    root = pathlib.Path(__file__).resolve().parents[2]
+    texts = [path.read_text() for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))]
+    filters = sorted({found for text in texts for found in re.findall(r"warploom bench --filter (\w+)", text)})
+    assert {"heads", "simulator", "tracking"} <= set(filters)
+    code = (
+        "import sys, pytest\n"
+        "from unittest.mock import Mock\n"
+        "from warploom.bench import run\n"
+        "class Each:\n"
+        "    @pytest.hookimpl(tryfirst=True)\n"
+        "    def pytest_collection_modifyitems(self, items):\n"
+        "        for text in sys.argv[1:]:\n"
+        "            one = run._Selection([text], 'cpu', False, Mock())\n"
+        "            print('CHOSEN', text, sum(one._wants(item) for item in items))\n"
+        "options = ['--collect-only', '-q', '-p', 'no:cacheprovider', '--import-mode=importlib', '-c', 'none.ini']\n"
+        "pytest.main([str(run._FOLDER), '--rootdir', str(run._FOLDER), *options], plugins=[Each()])\n"
+    )
+    (bench.folder / "none.ini").write_text("[pytest]\npython_files = bench_*.py\npython_functions = bench_*\n")
+    command = [sys.executable, "-c", code, *filters]
+    said = subprocess.run(command, cwd=bench.folder, capture_output=True, text=True, check=False).stdout
+    counts = dict(re.findall(r"CHOSEN (\w+) (\d+)", said))
+    assert set(counts) == set(filters), said[-2000:]
+    assert "0" not in counts.values(), counts
 
 
 def test_times_stand_in_a_table_beside_the_peers_and_in_a_report(first, bench):
