@@ -323,10 +323,14 @@ def import_class(dotted: str) -> type:
 
 
 def _modules_beside(dotted: str) -> list[str]:
-    """Dotted names of the modules in the package that a module would be in; of all there are where that is none."""
+    """Dotted names of the modules in the package that a module would be in; of all there are where that is none.
+
+    Those that begin with an underscore are nobody's to name.
+    """
     package, _, _ = dotted.rpartition(".")
     try:
         path = importlib.import_module(package).__path__ if package else None
     except (ImportError, AttributeError):
         return []
-    return [f"{package}.{one.name}" if package else one.name for one in pkgutil.iter_modules(path)]
+    names = [one.name for one in pkgutil.iter_modules(path) if not one.name.startswith("_")]
+    return [f"{package}.{name}" if package else name for name in names]

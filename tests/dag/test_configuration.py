@@ -301,6 +301,12 @@ def test_a_class_is_imported_from_warploom_or_from_a_package_of_the_users_own(tm
     assert import_class("warploom.dag.ConfigFile") is ConfigFile
 
 
+def test_a_private_module_is_not_proposed():
+    with pytest.raises(ConfigError, match="cannot import 'weakrefset'") as error:
+        import_class("weakrefset.WeakSet")
+    assert "_weakrefset" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("source", "name", "said"),
     [
