@@ -64,6 +64,19 @@ def test_a_request_is_answered_with_its_number(serve):
     assert json.loads(serve(scenario)[0])["id"] == "mine"
 
 
+def test_a_client_knows_when_the_supervisor_has_gone_away(serve):
+    clients = []
+
+    def scenario(path, _):
+        clients.append(ControlClient(path))
+        assert clients[0].ask("echo", x=1)["x"] == 1
+        assert not clients[0].ended
+
+    serve(scenario)
+    with clients[0] as client:
+        assert client.ended
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
