@@ -1,11 +1,13 @@
 """`python -m warploom.models.training.averaging`: one head of several trainings that began with the same weights.
 
 Networks fine-tuned from one checkpoint with different seeds lie in one valley, and the mean of their weights does at
-least as well as each by itself at the cost of one (model soups, Wortsman et al., ICML 2022).
+least as well as each by itself at the cost of one (model soups, Wortsman et al., ICML 2022). A share of the checkpoint
+that they began with keeps what it knew of scenes that they saw less of (Wortsman et al., CVPR 2022).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -19,21 +21,28 @@ from .network import PillarCenterNet
 __all__ = ["average_networks"]
 
 
-def average_networks(checkpoints: Sequence[Path], network: PillarCenterNet) -> PillarCenterNet:
+def average_networks(
+    checkpoints: Sequence[Path], network: PillarCenterNet, shares: Sequence[float] | None = None
+) -> PillarCenterNet:
     """Gives a network the mean of the weights of several checkpoints, of which each is a running average already.
 
     Args:
         checkpoints: `checkpoint.pt` of trainings of networks of the same shape.
         network: Of that shape; it is changed.
+        shares: How much each counts, relative to the others; None: all the same.
 
     Raises:
-        ValueError: None given.
+        ValueError: No checkpoint given, or shares that are not one positive number each.
     """
     if not checkpoints:
         raise ValueError("checkpoints must be one or more, not none")
+    if shares is not None and (len(shares) != len(checkpoints) or not all(0 < share < math.inf for share in shares)):
+        raise ValueError(f"shares must be {len(checkpoints)} positive numbers, one a checkpoint, not {list(shares)}")
+    weights = torch.tensor(shares or [1.0] * len(checkpoints), dtype=torch.float64)
+    weights /= weights.sum()
     states = [averaged_weights(torch.load(path, weights_only=True)) for path in checkpoints]
     mean = {
-        name: torch.stack([state[name].double() for state in states]).mean(0).to(first.dtype)
+        name: torch.tensordot(weights, torch.stack([state[name].double() for state in states]), 1).to(first.dtype)
         if first.is_floating_point()
         else first
         for name, first in states[0].items()
@@ -45,6 +54,9 @@ def average_networks(checkpoints: Sequence[Path], network: PillarCenterNet) -> P
 def main(
     checkpoints: Annotated[list[Path], typer.Argument(help="checkpoint.pt of each training.")],
     out: Annotated[Path, typer.Option(help="Folder for the head's ONNX and YAML.")],
+    share: Annotated[
+        list[float] | None, typer.Option(help="How much each counts, in their order; by default all the same.")
+    ] = None,
     stem: Annotated[int, typer.Option(help="As in training.")] = 24,
     blocks: Annotated[int, typer.Option(help="As in training.")] = 1,
     lean: Annotated[bool, typer.Option("--lean", help="As in training.")] = False,
@@ -61,7 +73,7 @@ def main(
         (stem, 48, 128), (1, blocks), LEAN_CHANNELS if lean else pillar_channels(), tuple(extra or ())
     )
     card = export_head(
-        average_networks(checkpoints, network),
+        average_networks(checkpoints, network, share),
         out,
         score_threshold=score,
         overlap_weight=overlap_weight,

@@ -30,6 +30,19 @@ def test_every_weight_is_the_mean(tmp_path):
         average_networks([], PillarCenterNet((8, 8, 8)))
 
 
+def test_shares_weigh_the_checkpoints(tmp_path):
+    paths = [tmp_path / name / "checkpoint.pt" for name in ("a", "b")]
+    one, other = (checkpoint(path, seed, (8, 8, 8)) for seed, path in enumerate(paths))
+    mean = average_networks(paths, PillarCenterNet((8, 8, 8)), [3.0, 1.0]).state_dict()
+    for name, value in mean.items():
+        if value.is_floating_point():
+            expected = 0.75 * one[name].double() + 0.25 * other[name].double()
+            torch.testing.assert_close(value.double(), expected, atol=1e-6, rtol=1e-6)
+    for wrong in ([1.0], [1.0, 0.0], [1.0, float("nan")], [1.0, 1.0, 1.0]):
+        with pytest.raises(ValueError, match="shares must be 2 positive numbers"):
+            average_networks(paths, PillarCenterNet((8, 8, 8)), wrong)
+
+
 def test_the_command_writes_a_head(tmp_path):
     checkpoint(tmp_path / "a" / "checkpoint.pt", 0, (16, 48, 128), (1, 2))
     main([tmp_path / "a" / "checkpoint.pt"], tmp_path / "head", stem=16, blocks=2, score=0.4)
