@@ -5,6 +5,7 @@ Importing this registers the checks with the launcher.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import socket
@@ -27,6 +28,7 @@ __all__ = [
     "check_memory",
     "check_models",
     "check_ports",
+    "check_remote",
     "check_sensors",
 ]
 
@@ -275,10 +277,25 @@ def check_groups(plan: LaunchPlan) -> Iterator[Finding]:
         yield Finding("cgroups", True, f"{', '.join(asked)}: without group and limits: {why}")
 
 
+def check_remote(plan: LaunchPlan) -> Iterator[Finding]:
+    """Is what carries topics between hosts installed, and does the node have a use for each of them?"""
+    remote = plan.spec.remote
+    if remote and importlib.util.find_spec("zenoh") is None:
+        yield Finding(
+            "remote", False, f"{', '.join(remote)}: topics between hosts need zenoh", "pip install 'warploom[net]'"
+        )
+    known = {topic for _, one in _components(plan) for topic in (*one.inputs.values(), *one.outputs.values())}
+    for topic in remote:
+        if topic not in known:
+            message = f"no module of the node commits or reads topic {topic!r}; {nearest(topic, known)}"
+            yield Finding("remote", False, message, f"correct it in remote of {plan.file.path}, or take it out")
+
+
 register_check("device", check_device)
 register_check("backend", check_backends)
 register_check("memory", check_memory)
 register_check("models", check_models)
 register_check("ports", check_ports)
 register_check("sensors", check_sensors)
+register_check("remote", check_remote)
 register_check("cgroups", check_groups)

@@ -1,5 +1,6 @@
 """Preflight: what is missing is named, each with the way out."""
 
+import importlib.util
 import shutil
 import socket
 
@@ -12,11 +13,12 @@ from warploom.components.preflight import (
     check_memory,
     check_models,
     check_ports,
+    check_remote,
     check_sensors,
 )
 from warploom.components.profile import load_profile
 from warploom.dag import load_module
-from warploom.dag.launch.lookup import CommandLine
+from warploom.dag.launch.lookup import CommandLine, load_launch_file
 from warploom.dag.launch.plan import LaunchPlan
 from warploom.dag.launch.preflight import registered_checks
 from warploom.models.card import DEFAULT_CARD
@@ -59,7 +61,7 @@ def one(findings, ok):
 
 
 def test_all_checks_are_registered():
-    assert {"device", "backend", "memory", "models", "ports", "sensors"} <= set(registered_checks())
+    assert {"device", "backend", "memory", "models", "ports", "sensors", "remote"} <= set(registered_checks())
 
 
 def test_a_device_that_is_there_and_one_that_is_not(plan):
@@ -147,6 +149,35 @@ def test_two_components_on_one_port_are_told(plan):
     assert first.ok
     assert not second.ok
     assert f"b/metrics: a/metrics is to answer on port {port} already" in second.message
+
+
+@pytest.fixture
+def sends(plan, tmp_path):
+    """Makes the same plan with topics that go between hosts."""
+
+    def make(*topics):
+        whole = plan()
+        text = f"node: one\nprocesses: [{{name: process, modules: [mine.yaml]}}]\nremote: {{{', '.join(topics)}}}\n"
+        (tmp_path / "l.yaml").write_text(text)
+        return LaunchPlan(load_launch_file(tmp_path / "l.yaml"), whole.modules, whole.profile)
+
+    return make
+
+
+def test_a_topic_between_hosts_that_the_node_has_no_use_for_is_told(sends):
+    assert list(check_remote(sends())) == []
+    assert list(check_remote(sends("raw: zenoh"))) == []
+    said = one(check_remote(sends("raw: zenoh", "rwa: zenoh")), False)
+    assert "topic 'rwa'; did you mean 'raw'?" in said
+    assert "l.yaml" in said
+
+
+def test_topics_between_hosts_without_what_carries_them_are_told(sends, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert list(check_remote(sends())) == []
+    said = one(check_remote(sends("raw: zenoh")), False)
+    assert "need zenoh" in said
+    assert "pip install 'warploom[net]'" in said
 
 
 @pytest.mark.parametrize(
