@@ -29,6 +29,7 @@ __all__ = [
     "default_card",
     "file_sha256",
     "load_card",
+    "read_yaml",
     "save_card",
 ]
 
@@ -188,6 +189,22 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""libyaml's, where PyYAML was built with it: ten times as fast, but it says less of a mistake."""
+
+
+def read_yaml(text: str) -> Any:
+    """What plain YAML says.
+
+    Raises:
+        yaml.YAMLError: It is none.
+    """
+    try:
+        return yaml.load(text, Loader=_LOADER)
+    except yaml.YAMLError:
+        return yaml.safe_load(text)
+
+
 @overload
 def load_card(path: str | Path) -> tuple[HeadCard, Path]: ...
 
@@ -215,7 +232,7 @@ def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[Model
     except OSError as error:
         raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
     try:
-        card = kind.model_validate(yaml.safe_load(text))
+        card = kind.model_validate(read_yaml(text))
     except yaml.YAMLError as error:
         raise ModelError(f"{path}: the card is not YAML: {error}") from error
     except ValidationError as error:

@@ -15,7 +15,7 @@ import warp as wp
 import yaml
 
 from ..errors import ModelError
-from .card import ModelCard, default_card
+from .card import ModelCard, default_card, read_yaml
 from .detections import Detections
 
 __all__ = ["KINDS", "LidarHead", "card_kind", "open_head", "read_card"]
@@ -60,7 +60,7 @@ def card_kind(path: str | Path) -> str:
         ModelError: It cannot be read, or is of no known kind.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text("utf-8"))
+        content = read_yaml(Path(path).read_text("utf-8"))
     except OSError as error:
         raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
     except (UnicodeDecodeError, yaml.YAMLError) as error:

@@ -73,7 +73,8 @@ class FusionProcessor(Processor):
         self._epoch: int | None = None
         self._ages: dict[str, float] = {}
         self._missing: tuple[str, ...] = fusion.sensors
-        assign(np.empty((0, 0)))  # loads SciPy now, half a second that the first frame would wait for
+        if fusion.sensors:  # a vehicle: it loads SciPy now, half a second that a frame would wait for
+            assign(np.empty((0, 0)))
 
     def process(self, trigger: Trigger) -> Status:
         """Takes up the detections of one frame."""
