@@ -26,8 +26,8 @@ from warploom.datamesh.transport import SharedMemoryConfig, ZenohConfig
 __all__ = ["WAYS", "BareMessage", "send_all"]
 
 Times = list[tuple[int, int]]
+"""Of each datum that a receiver begins: its number, and when [ns]."""
 
-STAMPS = 2  # int64 at the beginning of the data: when they were published, when they were begun
 KEPT = 4  # data that a reader keeps
 LOST = 2_000_000_000  # [ns] after which a datum is given up
 LOOK = 2e-4  # [s] from one look whether a datum has arrived to the next
@@ -50,8 +50,8 @@ class Way:
             queue: A queue of multiprocessing, for who wants one.
         """
 
-    def send(self, source: np.ndarray) -> None:
-        """Publishes a copy of `source`, int64, with the times in its first elements."""
+    def send(self, source: np.ndarray) -> tuple[int, int]:
+        """Publishes a copy of `source`, int64; gives when it did, and when it began to write it [ns]."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -59,14 +59,8 @@ class Way:
 
     @classmethod
     def receive(cls, name: str, size: int, count: int, queue: Any, ready: Any) -> Times:
-        """In the child: says that it is ready, receives, and gives how long each took, as `taken` does."""
+        """In the child: says that it is ready, and receives."""
         raise NotImplementedError
-
-
-def stamped(source: np.ndarray) -> np.ndarray:
-    """The source with the time in it, where what is published is the source itself."""
-    source[:STAMPS] = now()
-    return source
 
 
 _begun: Any = None
@@ -74,11 +68,11 @@ _begun: Any = None
 
 
 def taken(data: np.ndarray) -> tuple[int, int]:
-    """How long ago data were published, and begun [ns]."""
+    """The number of a datum, its first element, and when it was begun, which is now [ns]."""
     here = now()
     if _begun is not None:
         _begun.value += 1
-    return here - int(data[0]), here - int(data[1])
+    return int(data[0]), here
 
 
 class Warploom(Way):
@@ -110,16 +104,17 @@ class Warploom(Way):
         links.start()
         return links
 
-    def send(self, source: np.ndarray) -> None:
+    def send(self, source: np.ndarray) -> tuple[int, int]:
         with self._output.allocate_change() as change:
             begun = now()
             data = change.array(len(source), np.int64)
             data[:] = source
             change.set_version(self._version)
             change.value = data
-            data[:STAMPS] = now(), begun
+            published = now()
             self._output.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
         self._version += 1
+        return published, begun
 
     def close(self) -> None:
         self._links.stop()
@@ -180,8 +175,10 @@ class Queue(Way):
     def __init__(self, name: str, size: int, queue: Any) -> None:
         self._queue = queue
 
-    def send(self, source: np.ndarray) -> None:
-        self._queue.put(stamped(source))
+    def send(self, source: np.ndarray) -> tuple[int, int]:
+        published = now()
+        self._queue.put(source)
+        return published, published
 
     @classmethod
     def receive(cls, name: str, size: int, count: int, queue: Any, ready: Any) -> Times:
@@ -211,8 +208,10 @@ class Zenoh(Way):
         config.insert_json5("transport/shared_memory/enabled", "true" if cls.shared else "false")
         return zenoh.open(config)
 
-    def send(self, source: np.ndarray) -> None:
-        self._publisher.put(stamped(source).tobytes())
+    def send(self, source: np.ndarray) -> tuple[int, int]:
+        published = now()
+        self._publisher.put(source.tobytes())
+        return published, published
 
     def close(self) -> None:
         self._session.close()
@@ -225,7 +224,7 @@ class Zenoh(Way):
         def read(sample: Any) -> None:
             data = np.frombuffer(sample.payload.to_bytes(), np.int64)
             times.append(taken(data))
-            if data[-1] == count - 1:
+            if data[0] == count - 1:
                 ended.set()
 
         with cls.session(name, listens=False) as session:
@@ -249,11 +248,13 @@ class ZenohSharedMemory(Zenoh):
         self._provider = ShmProvider.default_backend(max(1 << 20, 8 * size))
         self._policy = BlockOn(GarbageCollect())
 
-    def send(self, source: np.ndarray) -> None:
+    def send(self, source: np.ndarray) -> tuple[int, int]:
+        begun = now()
         buffer = self._provider.alloc(source.nbytes, self._policy)
-        source[:STAMPS] = now()
         buffer[:] = source.tobytes()
+        published = now()
         self._publisher.put(buffer)
+        return published, begun
 
 
 class Iceoryx(Way):
@@ -268,14 +269,15 @@ class Iceoryx(Way):
         self._notifier = event.notifier_builder().create()
         self._size = size
 
-    def send(self, source: np.ndarray) -> None:
+    def send(self, source: np.ndarray) -> tuple[int, int]:
         begun = now()
         sample = self._publisher.loan_slice_uninit(self._size)
         data = _array(sample.payload().data_ptr, self._size)
         data[:] = source
-        data[:STAMPS] = now(), begun
+        published = now()
         sample.assume_init().send()
         self._notifier.notify()
+        return published, begun
 
     def close(self) -> None:
         self._publisher.delete()
@@ -293,7 +295,7 @@ class Iceoryx(Way):
             while (sample := subscriber.receive()) is not None:
                 data = _array(sample.payload().data_ptr, size)
                 times.append(taken(data))
-                if data[-1] == count - 1:
+                if data[0] == count - 1:
                     return times
 
 
@@ -325,14 +327,15 @@ class Posix(Way):
         self._blocks = np.frombuffer(self._memory.buf, np.int64).reshape(self.BLOCKS, -1)
         self._number = 0
 
-    def send(self, source: np.ndarray) -> None:
+    def send(self, source: np.ndarray) -> tuple[int, int]:
         begun = now()
         number = self._number % self.BLOCKS
         data = self._blocks[number, : len(source)]
         data[:] = source
-        data[:STAMPS] = now(), begun
+        published = now()
         self._socket.sendto(bytes((number,)), self._address)
         self._number += 1
+        return published, begun
 
     def close(self) -> None:
         self._socket.close()
@@ -471,6 +474,7 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
     name = f"warploom-bench-{os.getpid()}{now() % 10**6:06d}"
     queue = multiprocessing.get_context("spawn").Queue()
     source = np.arange(size // 8)
+    sent = []
     bare = BareMessage()
     sender = None
     try:
@@ -482,15 +486,16 @@ def send_all(way: str, size: int, count: int, every_s: float) -> tuple[np.ndarra
                 time.sleep(every_s / 2)
                 bare.send()
                 time.sleep(every_s / 2)
-                source[-1] = number
+                source[0] = number
                 before, end = begun.value, now() + LOST
-                sender.send(source)
+                sent.append(sender.send(source))
                 while begun.value == before and now() < end:  # nothing waits behind another: what one takes, unloaded
                     time.sleep(LOOK)
             if not result.poll(PATIENCE):
                 raise TimeoutError(f"{way}: not all of {count} data of {size} bytes have arrived")
             times, share = result.recv()
-        return np.array(times, np.int64).reshape(-1, 2), bare.end(), share
+        took = [(here - sent[number][0], here - sent[number][1]) for number, here in times]
+        return np.array(took, np.int64).reshape(-1, 2), bare.end(), share
     finally:
         bare.close()
         if sender is not None:

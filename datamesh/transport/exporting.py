@@ -39,6 +39,8 @@ from .wire import (
     INLINE,
     LEAVES,
     MESSAGE,
+    NEWEST,
+    NEWEST_TRIGGERS,
     RELEASE,
     SETTLE,
     Event,
@@ -112,6 +114,7 @@ class Exporter:
             self.order = OrderFile(node, window.topic)
             """Under which epochs others see those of the window."""
             self._pool = SlabPool(self._config.memory_bytes)
+            self._region = self._pool.region
         except BaseException:
             unlisten(node, window.topic)
             self._listener.close()
@@ -186,23 +189,46 @@ class Exporter:
     # Commits
 
     def _on_commit(self, entry: Entry) -> None:
+        version, value, received, committed, epoch, triggers, completion, _ = entry
         with self._lock:
             if self._stopped:
                 return
-            version, value, _, _, epoch, _, completion, _ = entry
             order = (epoch, version)
             epoch = self.order.epoch(epoch, version)
             if (
                 type(value) is _ndarray
                 and type(base := value.base) is Lease
+                and type(slab := base.key) is Slab
+                and slab.region is self._region
                 and completion is None
                 and order > self._newest
                 and not self._behind
                 and not self._absent.readers
-                and (place := self._pool.place(base)) is not None
             ):
+                # An array that lies in a slab: what `_tell` does, without a call of what has left the caches since.
                 self._newest = order
-                self._tell_array(entry, epoch, *place)
+                offset = base.begin - slab.offset
+                form = value.dtype, value.shape, offset
+                if form != self._form:
+                    self._form, self._body = form, encode(value, partial(_in_first_slab, offset))
+                flags = NEWEST_TRIGGERS if triggers else NEWEST
+                for reader in tuple(self._readers):
+                    number = reader.number + 1
+                    head = pack_commit(
+                        COMMIT, flags, 1, 0, number, epoch, version, received, committed, slab.offset, slab.size
+                    )
+                    try:
+                        if reader.held >= reader.most:
+                            raise BlockingIOError
+                        reader.send(head + self._body)
+                    except OSError:
+                        self._tell(entry, epoch, True, [reader])
+                        continue
+                    reader.number = number
+                    self._counts["sent"] += 1
+                    self._counts["sent_bytes"] += len(head) + len(self._body)
+                    reader.holds((slab,))
+                    reader.has_sent(entry, epoch, True)
                 self._has_told()
                 return
             newest = order > self._newest or self._window.snapshot().versions[-1] == version
@@ -225,30 +251,6 @@ class Exporter:
         if self._begun_ns:
             self._due_ns = self._durations.add(now - self._begun_ns)
             self._begun_ns = 0
-
-    def _tell_array(self, entry: Entry, epoch: int, slab: Slab, offset: int) -> None:
-        """Sends an array that lies in a slab: what `_tell` does, without a call of what has left the caches since."""
-        version, value, received, committed, _, triggers, _, _ = entry
-        form = value.dtype, value.shape, offset
-        if form != self._form:
-            self._form, self._body = form, encode(value, lambda array: (0, offset))
-        for reader in tuple(self._readers):
-            number = reader.number + 1
-            message = (
-                pack_commit(number, epoch, version, received, committed, triggers, slab.offset, slab.size) + self._body
-            )
-            try:
-                if reader.held >= reader.most:
-                    raise BlockingIOError
-                reader.send(message)
-            except OSError:
-                self._tell(entry, epoch, True, [reader])
-                continue
-            reader.number = number
-            self._counts["sent"] += 1
-            self._counts["sent_bytes"] += len(message)
-            reader.holds((slab,))
-            reader.has_sent(entry, epoch, True)
 
     def _on_settle(self, version: int, epoch: int) -> None:
         with self._lock:
@@ -549,3 +551,8 @@ class Exporter:
         for offset in reader.slabs():
             reader.lets_go(offset)
             self._pool.release(self._pool.at(offset))
+
+
+def _in_first_slab(offset: int, array: np.ndarray) -> tuple[int, int]:
+    """Where the one array of a payload lies, as `encode` asks."""
+    return 0, offset

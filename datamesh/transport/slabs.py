@@ -122,9 +122,10 @@ class Region:
 class Slab:
     """One block of a pool; free again once nobody holds it."""
 
-    __slots__ = ("holders", "offset", "order", "size")
+    __slots__ = ("holders", "offset", "order", "region", "size")
 
-    def __init__(self, offset: int, order: int) -> None:
+    def __init__(self, region: Region, offset: int, order: int) -> None:
+        self.region = region
         self.offset = offset
         self.order = order
         self.size = PAGE << order
@@ -176,7 +177,7 @@ class SlabPool:
         while found > order:
             found -= 1
             self._free[found].append(offset + (PAGE << found))
-        slab = Slab(offset, order)
+        slab = Slab(self.region, offset, order)
         self._slabs[offset] = slab
         insort(self._used, offset)
         return slab
@@ -211,18 +212,11 @@ class SlabPool:
             order += 1
         self._free[order].append(offset)
 
-    def place(self, lease: Lease) -> tuple[Slab, int] | None:
-        """The slab that a lease is of, and where it begins there; None where it is of another memory."""
-        slab = lease.key
-        if type(slab) is Slab and self._slabs.get(slab.offset) is slab:
-            return slab, lease.begin - slab.offset
-        return None
-
     def locate(self, array: np.ndarray) -> tuple[Slab, int] | None:
         """The slab in which an array lies, one piece in C order, and where; None where it lies elsewhere."""
         base = array.base
-        if type(base) is Lease and (place := self.place(base)) is not None:
-            return place  # as it was made: to ask where an array lies takes long
+        if type(base) is Lease and type(slab := base.key) is Slab and slab.region is self.region:
+            return slab, base.begin - slab.offset  # as it was made: to ask where an array lies takes long
         interface = array.__array_interface__
         if interface["strides"] is not None:
             return None

@@ -24,6 +24,8 @@ __all__ = [
     "INLINE",
     "LEAVES",
     "MESSAGE",
+    "NEWEST",
+    "NEWEST_TRIGGERS",
     "RELEASE",
     "SETTLE",
     "SOON",
@@ -59,7 +61,11 @@ _pack_head, _unpack_head, _unpack_slab, _put_number = (
     _SLAB.unpack_from,
     _NUMBER.pack_into,
 )
-_pack_commit = struct.Struct(f"{_HEAD.format}{_SLAB.format[1:]}").pack
+NEWEST, NEWEST_TRIGGERS = _NEWEST, _NEWEST | _TRIGGERS
+"""Flags of a commit that is the newest, without and with starting runs."""
+pack_commit = struct.Struct(f"{_HEAD.format}{_SLAB.format[1:]}").pack
+"""What stands before the body of a commit that lies in one slab, in one go: `COMMIT`, flags, 1 (slab), 0, number,
+epoch, version, received [ns], committed [ns], offset and size of the slab [B]."""
 _PROTOCOL = 2
 _MOST_SLABS = 256
 
@@ -97,14 +103,6 @@ def pack_event(event: Event) -> bytearray:
         data += _SLAB.pack(*slab)
     data += body
     return data
-
-
-def pack_commit(
-    number: int, epoch: int, version: int, received_ns: int, committed_ns: int, triggers: bool, offset: int, size: int
-) -> bytes:
-    """What stands before the body of a commit that is the newest and lies in one slab, in one go."""
-    flags = _TRIGGERS | _NEWEST if triggers else _NEWEST
-    return _pack_commit(COMMIT, flags, 1, 0, number, epoch, version, received_ns, committed_ns, offset, size)
 
 
 def pack_soon(core: int, soon_ns: int, late_ns: int) -> bytes:

@@ -12,7 +12,7 @@ from warploom.datamesh.transport.slabs import PAGE, Slab
 
 
 def slab(number):
-    return Slab(number * PAGE, 0)
+    return Slab(None, number * PAGE, 0)  # in which memory is not what a reader asks
 
 
 @pytest.fixture

@@ -7,6 +7,8 @@ from hypothesis import given
 from warploom.datamesh.messages import encode
 from warploom.datamesh.transport.wire import (
     COMMIT,
+    NEWEST,
+    NEWEST_TRIGGERS,
     SETTLE,
     SOON,
     Event,
@@ -65,7 +67,9 @@ def test_a_commit_in_one_slab_is_packed_the_same_way_in_one_go(
     number, epoch, version, received, committed, triggers, offset, size, body
 ):
     event = Event(COMMIT, number, epoch, version, received, committed, triggers, True, ((offset, size),), body)
-    assert pack_commit(number, epoch, version, received, committed, triggers, offset, size) + body == pack_event(event)
+    flags = NEWEST_TRIGGERS if triggers else NEWEST
+    head = pack_commit(COMMIT, flags, 1, 0, number, epoch, version, received, committed, offset, size)
+    assert head + body == pack_event(event)
 
 
 @given(EVENTS, U64)
