@@ -190,7 +190,10 @@ def lines_of(result: DetectionEvaluation) -> list[str]:
                 said = "  ".join(f"{level} {_number(v['ap'])} (of {v['objects']})" for level, v in levels.items())
                 lines.append(f"  KITTI AP R40 {kind_name} {metric}: {said}")
         for name, ap in figures.get("bev_ap", {}).items():
-            lines.append(f"  BEV AP@{ap['overlap']:g} {name}: {ap['ap']:.1f} of {ap['objects']}")
+            line = f"  BEV AP@{ap['overlap']:g} {name}: {ap['ap']:.1f} of {ap['objects']}"
+            if half := ap.get("half_visible"):
+                line += f"; of what is half visible or more {half['ap']:.1f} of {half['objects']}"
+            lines.append(line)
         scores = figures.get("nuscenes", {})
         for name, each in scores.get("classes", {}).items():
             distances = "  ".join(f"{key} m {_number(value, 3)}" for key, value in each["ap_by_distance"].items())

@@ -39,6 +39,7 @@ _NUSCENES_CLASSES = (
 )
 _BEV_OVERLAPS = {VEHICLE: 0.7, PEDESTRIAN: 0.5, CYCLIST: 0.5, CONE: 0.5, BARRIER: 0.5}
 _BEV_RANGE, _BEV_POINTS = 60.0, 10
+_HALF_VISIBLE = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,20 +286,33 @@ def _nuscenes(outcomes: list[FrameOutcome]) -> dict[str, Any]:
 def _bev(outcomes: list[FrameOutcome]) -> dict[str, Any]:
     """AP by overlap from above: objects with 10 points within 60 m, the others neither right nor wrong to find.
 
-    Detections beyond that range are left out, as are the true objects there, and as nuScenes' kit does with both.
+    Detections beyond that range are left out, as are the true objects there, and as nuScenes' kit does with both. Where
+    it is known how much of each object can be seen, the same of those that are half visible or more: KITTI's kit leaves
+    out what is largely occluded.
     """
+    result = _bev_where(outcomes, 0.0)
+    if all(each.frame.visible is not None for each in outcomes):
+        for name, figures in _bev_where(outcomes, _HALF_VISIBLE).items():
+            result[name]["half_visible"] = figures
+    return result
+
+
+def _bev_where(outcomes: list[FrameOutcome], least_visible: float) -> dict[str, Any]:
     frames = []
     for each in outcomes:
         found = each.found.select(np.hypot(each.found.boxes[:, 0], each.found.boxes[:, 1]) < _BEV_RANGE)
-        far = np.hypot(each.frame.boxes[:, 0], each.frame.boxes[:, 1]) >= _BEV_RANGE
+        frame = each.frame
+        ignore = (frame.counts < _BEV_POINTS) | (np.hypot(frame.boxes[:, 0], frame.boxes[:, 1]) >= _BEV_RANGE)
+        if least_visible > 0.0:
+            ignore |= np.asarray(frame.visible) < least_visible
         frames.append(
             DetectionFrame(
                 boxes=found.boxes,
                 scores=found.scores,
                 classes=found.classes,
-                truth=each.frame.boxes.astype(np.float32),
-                truth_classes=each.frame.classes,
-                ignore=(each.frame.counts < _BEV_POINTS) | far,
+                truth=frame.boxes.astype(np.float32),
+                truth_classes=frame.classes,
+                ignore=ignore,
             )
         )
     result = {}

@@ -90,6 +90,8 @@ class EvaluationFrame:
     image: pathlib.Path | None = None
     """The left colour camera's."""
     point_labels: PointLabels | None = None
+    visible: np.ndarray | None = None
+    """How much of each object can be seen, 0 to 1, shape (m,); None where nothing tells."""
 
 
 def evaluation_frames(uri: str) -> Iterator[EvaluationFrame]:
@@ -170,13 +172,13 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
         lidar = options.get("lidar", str, None)
         if seeds.stop > _HELD_OUT:
             raise ConfigError(f"{uri}: seeds from {_HELD_OUT} on are trained on; take lower ones")
-        named = ((f"scene {seed}", sample_scene(seed, lidar=lidar)) for seed in seeds)
+        named = ((f"scene {seed}", sample_scene(seed, lidar=lidar, visibility=True)) for seed in seeds)
     else:
         options = _Keys(uri, keys, ("seed", "lidar", "duration", "rate", "every", "height", "mounting_height"))
         given = {"seed": int, "lidar": str, "duration": float, "rate": float, "mounting_height": float}
         arguments = {name: options.get(name, kind, None) for name, kind in given.items() if name in keys}
         try:
-            drive = Simulator(scenario=place, turning=False, **arguments)
+            drive = Simulator(scenario=place, turning=False, visibility=True, **arguments)
         except ValueError as error:
             raise ConfigError(f"{uri}: {error}") from None
         steps = range(0, len(drive), options.get("every", _every, 1))
@@ -193,6 +195,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
             types=tuple("object" for _ in frame.classes),
             counts=frame.counts,
             velocities=np.asarray(frame.velocities, np.float64),
+            visible=frame.visible,
         )
 
 

@@ -252,3 +252,28 @@ def test_what_is_found_beyond_the_range_is_neither_right_nor_wrong(tmp_path):
     assert average(10.0) == (100.0, 1)
     assert average(73.0, 10.0) == (100.0, 1)
     assert average(30.0, 10.0) == (50.0, 1)
+
+
+def test_what_is_hidden_for_the_most_part_is_told_apart_where_that_is_known():
+    """One car of two is found, the other is behind something: half of all, all of what is half visible or more."""
+    boxes = np.array([[x, 0, 0, 4, 2, 2, 0] for x in (10.0, 20.0)], np.float64)
+    found = Detections(
+        boxes=boxes[:1].astype(np.float32),
+        scores=np.array([0.9], np.float32),
+        classes=np.zeros(1, np.int32),
+        velocities=np.full((1, 2), np.nan, np.float32),
+        background=np.zeros(1, bool),
+    )
+
+    def average(visible):
+        frame = EvaluationFrame(
+            name="one", kind="sim", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
+            classes=np.zeros(2, np.int32), types=("object",) * 2, counts=np.full(2, 50), velocities=np.zeros((2, 2)),
+            visible=visible,
+        )  # fmt: skip
+        return figures_of("sim", [judge(frame, found, 0.0, 0.4, None)], 0.4, (), None)["bev_ap"]["vehicle"]
+
+    assert "half_visible" not in average(None)
+    figures = average(np.array([0.9, 0.2]))
+    assert (figures["ap"], figures["objects"]) == (50.0, 2)
+    assert (figures["half_visible"]["ap"], figures["half_visible"]["objects"]) == (100.0, 1)
