@@ -99,7 +99,10 @@ def check_backends(plan: LaunchPlan) -> Iterator[Finding]:
         try:
             uses_taichi(backend)
         except (DeviceError, ImportError, ValueError) as error:
-            yield Finding("backend", False, f"{kernel}: {error}", f"--set profile.backends.{kernel}=warp")
+            yield Finding(
+                "backend", False, f"{kernel}: {error}",
+                f"--set profile.backends.{kernel}=warp, or another profile (--profile taichi-cpu, --profile cpu)",
+            )  # fmt: skip
         else:
             yield Finding("backend", True, f"{kernel} by {backend}")
 

@@ -11,11 +11,10 @@ from pydantic import Field
 
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
-from ...kernels.backend import uses_taichi
 from ...kernels.cluster import EuclideanCluster
 from ...kernels.selection import select_heights
 from ..execution import ExecutionContext, empty_cloud
-from .backends import Backend
+from .backends import Backend, check_backend
 from .filtering import FilteredCloud
 from .ground import GroundSurface
 
@@ -67,7 +66,7 @@ class ClusterProcessor(Processor):
             DeviceError: Taichi cannot compute on its device.
         """
         self._backend = config.backend or self.context.backends.get("cluster", "warp")
-        uses_taichi(self._backend)
+        check_backend(self._backend, "cluster")
 
     def init(self, config: ClusterConfig) -> None:
         """Makes a plan for each frame in flight; one for Taichi, whose labels are copied."""

@@ -9,10 +9,9 @@ import warp as wp
 
 from ...dag import In, Out, Processor, ProcessorConfig, Trigger
 from ...datamesh import Status
-from ...kernels.backend import uses_taichi
 from ...kernels.ground import GroundSegment, segment_ground
 from ..execution import ExecutionContext, empty_cloud
-from .backends import Backend
+from .backends import Backend, check_backend
 from .filtering import FilteredCloud
 
 __all__ = ["GroundConfig", "GroundProcessor", "GroundSurface"]
@@ -54,7 +53,7 @@ class GroundProcessor(Processor):
             DeviceError: Taichi cannot compute on its device.
         """
         self._backend = config.backend or self.context.backends.get("ground", "warp")
-        uses_taichi(self._backend)
+        check_backend(self._backend, "ground")
 
     def init(self, config: GroundConfig) -> None:
         """Makes a plan for each frame in flight; Taichi keeps its own."""

@@ -28,6 +28,13 @@ __all__ = ["DEFAULT_TAICHI", "check_count", "give_back", "has_64_bits", "launchi
 DEFAULT_TAICHI = "taichi"
 _ARCHS = ("cpu", "vulkan", "metal", "cuda")
 _CPU_ARCHS = ("x64", "arm64")
+_NEEDS = {
+    "vulkan": "it needs a GPU whose driver speaks Vulkan 1.1 or newer, and Vulkan's loader (on Debian and Ubuntu "
+    "libvulkan1, and mesa-vulkan-drivers for AMD and Intel); `vulkaninfo --summary` of vulkan-tools lists what is",
+    "metal": "it needs a Mac",
+    "cuda": "it needs an NVIDIA GPU and its driver; `nvidia-smi` lists what is there",
+}
+"""What has to be there for an arch."""
 
 launching = threading.RLock()
 """Held while a kernel is launched, since Taichi's runtime serves one thread at a time."""
@@ -87,7 +94,8 @@ def _initialise(arch: str, threads: int | None) -> None:
     try:
         started.result()
     except RuntimeError as error:
-        raise DeviceError(f"Taichi cannot compute on 'taichi:{arch}' here: {error}") from error
+        needs = f"; {_NEEDS[arch]}" if arch in _NEEDS else ""
+        raise DeviceError(f"Taichi cannot compute on 'taichi:{arch}' here: {error}{needs}") from error
 
 
 @ti.kernel
