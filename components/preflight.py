@@ -10,6 +10,7 @@ import math
 import os
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -165,7 +166,7 @@ def check_ports(plan: LaunchPlan) -> Iterator[Finding]:
         if not isinstance(port, int) or isinstance(port, bool) or port == 0:
             continue
         who = f"{process}/{component.name}"
-        way_out = f"--set {component.name}.port=0 takes a free one, null none"
+        way_out = f"--set {component.name}.port=N takes another, 0 any that is free, null none"
         if port in asked:
             yield Finding("ports", False, f"{who}: {asked[port]} is to answer on port {port} already", way_out)
             continue
@@ -181,12 +182,20 @@ def _cannot_listen(port: int) -> str | None:
         try:
             probe.bind(("127.0.0.1", port))
         except PermissionError:
-            return "not permitted to this user (below 1024 it needs CAP_NET_BIND_SERVICE)"
+            return f"not permitted to this user (below {_first_free_port()} it needs CAP_NET_BIND_SERVICE)"
         except OSError as error:
             return f"taken: {error.strerror or error}"
         except OverflowError:
             return "no port: they go to 65535"
     return None
+
+
+def _first_free_port() -> int:
+    """The first port that needs no permission."""
+    try:
+        return int(Path("/proc/sys/net/ipv4/ip_unprivileged_port_start").read_text())
+    except (OSError, ValueError):
+        return 1024
 
 
 def check_sensors(plan: LaunchPlan) -> Iterator[Finding]:
@@ -275,9 +284,15 @@ def _components(plan: LaunchPlan) -> Iterator[tuple[str, ComponentSpec]]:
 def check_groups(plan: LaunchPlan) -> Iterator[Finding]:
     """Can control groups be made? Without them the processes run all the same, so that nothing is missing."""
     asked = [process.name for process in plan.spec.processes if process.group is not None]
-    why = ControlGroups().refusal() if asked else None
-    if why is not None:
+    if not asked:
+        return
+    groups = ControlGroups()
+    if (why := groups.refusal()) is not None:
         yield Finding("cgroups", True, f"{', '.join(asked)}: without group and limits: {why}")
+        return
+    for process in plan.spec.processes:
+        if (why := groups.missing(process.limits)) is not None:
+            yield Finding("cgroups", True, f"{process.name}: without limits: {why}")
 
 
 def check_remote(plan: LaunchPlan) -> Iterator[Finding]:

@@ -37,10 +37,35 @@ class ControlGroups:
         """Why no group can be made here, with the way out; None where one can. Changes nothing."""
         if self._mount is None:
             return "this system has no cgroup v2"
+        # To put a process into a group below, its own file and that of the group must both be writable.
         folder = self._mount / self._own
-        if not os.access(folder, os.W_OK):
-            return f"{folder}: not permitted. {_WAY_OUT}"
+        for path in (folder, folder / "cgroup.procs"):
+            if path.exists() and not os.access(path, os.W_OK):
+                read_only = os.statvfs(path).f_flag & os.ST_RDONLY
+                why = "is mounted read-only" if read_only else "is not writable for this user"
+                return f"{path}: {why}. {_WAY_OUT}"
+        if not folder.is_dir():
+            return f"{folder}: there is no such group. {_WAY_OUT}"
         return None
+
+    def missing(self, limits: LimitsSpec) -> str | None:
+        """Which of these limits nobody can set here, and why; None where the system has all that they need."""
+        if self._mount is None or not (values := limits.files(_PERIOD_US)):
+            return None
+        top = self._mount / self._own
+        try:
+            there = set((top / "cgroup.controllers").read_text().split())
+        except OSError:
+            return None
+        wanted = {name: name.partition(".")[0] for name in values}
+        lacking = sorted(set(wanted.values()) - there)
+        if not lacking:
+            return None
+        names = ", ".join(name for name, controller in wanted.items() if controller in lacking)
+        return (
+            f"{names}: {top} has no controller {' and no '.join(lacking)} (cgroup.controllers). Way out: let the group "
+            "above pass it on (Delegate=yes), or give it to cgroup v2 (systemd.unified_cgroup_hierarchy=1 at boot)"
+        )
 
     def join(self, group: str, pid: int, limits: LimitsSpec | None = None) -> list[str]:
         """Puts a process into a group, which is made where there is none, and limits it.
@@ -60,14 +85,14 @@ class ControlGroups:
             self._make(folder)
         except OSError as error:
             return [f"cgroup {group}: {_told(error, folder)}; the process runs without. {_WAY_OUT}"]
-        values = {} if limits is None else limits.files(_PERIOD_US)
-        warnings = self._limit(group, folder, values) if values else []
+        warnings = [] if limits is None else self._limit(group, folder, limits)
         try:
             (folder / "cgroup.procs").write_text(f"{pid}\n")
         except ProcessLookupError:  # it has ended already, which is told elsewhere
             pass
         except OSError as error:
-            warnings.append(f"cgroup {group}: {_told(error, folder)}; the process runs without. {_WAY_OUT}")
+            told = _told(error, folder / "cgroup.procs")
+            warnings.append(f"cgroup {group}: {told}; the process runs without. {_WAY_OUT}")
         return warnings
 
     def _make(self, folder: Path) -> None:
@@ -115,11 +140,15 @@ class ControlGroups:
         self._note()
         return removed
 
-    def _limit(self, group: str, folder: Path, values: dict[str, str]) -> list[str]:
+    def _limit(self, group: str, folder: Path, limits: LimitsSpec) -> list[str]:
         """Writes the limits of a group; what cannot be limited is told."""
-        wanted = {name.partition(".")[0] for name in values}
+        values = limits.files(_PERIOD_US)
+        if not values:
+            return []
+        if lacking := self.missing(limits):
+            return [f"cgroup {group}: the process runs without limits: {lacking}"]
         try:
-            self._enable(folder.parent, wanted)
+            self._enable(folder.parent, {name.partition(".")[0] for name in values})
         except OSError as error:
             names = ", ".join(values)
             return [f"cgroup {group}: {names}: {_told(error, folder)}; the process runs without limits. {_WAY_OUT}"]
@@ -128,7 +157,8 @@ class ControlGroups:
             try:
                 (folder / name).write_text(f"{value}\n")
             except OSError as error:
-                warnings.append(f"cgroup {group}: {name}: {_told(error, folder)}; the process runs without this limit")
+                told = _told(error, folder / name)
+                warnings.append(f"cgroup {group}: {told}; the process runs without this limit")
         return warnings
 
     def _enable(self, folder: Path, controllers: set[str]) -> None:

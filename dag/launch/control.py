@@ -201,13 +201,16 @@ def connect(node: str | None = None) -> tuple[str, ControlClient]:
     Raises:
         ConfigError: It does not run, or there are several; the message says which do.
     """
+    base = run_base()
+    if base.exists() and not os.access(base, os.R_OK | os.X_OK):
+        raise ConfigError(f"{base}: is not readable for this user: ask as the user who runs the node, or as root")
     running = running_nodes()
     if node is None:
         if len(running) != 1:
             if running:
                 raise ConfigError(f"several nodes run: {', '.join(running)}; say which with --node")
             raise ConfigError(
-                f"no node runs: none is in {run_base()}, where $WARPLOOM_RUN or $XDG_RUNTIME_DIR says; "
+                f"no node runs: none is in {base}, where $WARPLOOM_RUN or $XDG_RUNTIME_DIR says; "
                 "`warploom launch` starts one"
             )
         node = running[0]

@@ -39,6 +39,11 @@ class Printed:
         """The file of the log."""
         return str(self._log.path)
 
+    @property
+    def lost(self) -> int:
+        """Bytes that the log could not take, as on a full disk."""
+        return self._log.lost
+
     def open(self) -> None:
         """Opens the log: what a supervisor holds does not depend on what its processes print."""
         self._log.write(b"")

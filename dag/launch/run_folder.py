@@ -57,7 +57,10 @@ class RunFolder:
                 f"{self.control}: the path of a socket has at most {_SOCKET_BYTES} bytes: set WARPLOOM_RUN"
             )
         self._make()
-        lock = (self.path / "lock").open("a+b")
+        try:
+            lock = (self.path / "lock").open("a+b")
+        except OSError as error:
+            raise self._unusable(error) from error
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -67,9 +70,14 @@ class RunFolder:
             raise ConfigError(
                 f"node {self.node!r} runs already (process {pid}): stop it first, or give this one another name"
             ) from None
-        lock.truncate(0)
-        lock.write(str(os.getpid()).encode())
-        lock.flush()
+        try:
+            lock.truncate(0)
+            lock.write(str(os.getpid()).encode())
+            lock.flush()
+        except OSError as error:
+            with contextlib.suppress(OSError):  # what could not be written is tried again as it is closed
+                lock.close()
+            raise self._unusable(error) from error
         self._lock = lock
         self.control.unlink(missing_ok=True)
         self._end_handover()
@@ -80,7 +88,11 @@ class RunFolder:
             for folder in (made / "log", made / "plan"):
                 folder.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"{made}: cannot be written: {error.strerror}; set WARPLOOM_RUN to another") from error
+            raise self._unusable(error) from error
+
+    def _unusable(self, error: OSError) -> ConfigError:
+        why = error.strerror or error
+        return ConfigError(f"{self.path}: cannot be written: {why}; make room there, or set WARPLOOM_RUN to another")
 
     def close(self) -> None:
         """Removes the socket and gives the lock back; the logs stay."""
@@ -122,6 +134,18 @@ class RunFolder:
     def plan(self, process: str) -> Path:
         """Where a process reads what it is to run."""
         return self.path / "plan" / f"{process}.json"
+
+    def write_plan(self, process: str, text: str) -> None:
+        """Leaves there what a process is to run.
+
+        Raises:
+            ConfigError: It cannot be written, as on a full disk.
+        """
+        try:
+            self.plan(process).parent.mkdir(mode=0o700, exist_ok=True)
+            self.plan(process).write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise self._unusable(error) from error
 
 
 class RotatedLog:

@@ -45,6 +45,7 @@ def _process(process: SupervisedProcess) -> dict[str, Any]:
         "modules": list(process.spec.modules),
         "warnings": list(process.warnings),
         "log": process.log_path,
+        "log_lost": process.log_lost,
         **(_usage(process.pid) if process.pid is not None else {}),
         "components": [
             {

@@ -149,6 +149,11 @@ class SupervisedProcess:
         """The file of its output."""
         return self._printed.path
 
+    @property
+    def log_lost(self) -> int:
+        """Bytes of its output that this file could not take, as on a full disk."""
+        return self._printed.lost
+
     def _tell(self, event: str, **details: Any) -> None:
         self._on_event({"event": event, "process": self.name, **details})
 

@@ -6,6 +6,7 @@ It sleeps until something happens: the end of a process (pidfd), a message of on
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import json
 import logging
@@ -135,7 +136,6 @@ class Supervisor:
             await self._control.close()
 
     def _add(self, spec: ProcessSpec) -> None:
-        path = self.folder.plan(spec.name)
         plan = {
             "node": self.plan.node,
             "process": spec.model_dump(),
@@ -144,7 +144,15 @@ class Supervisor:
             "zenoh": self.plan.spec.zenoh.model_dump(),
             **self._child_plan(spec),
         }
-        path.write_text(json.dumps(plan, default=str), encoding="utf-8")
+        text = json.dumps(plan, default=str)
+        self.folder.write_plan(spec.name, text)
+
+        def before_start() -> None:
+            self._clean()
+            if not self.folder.plan(spec.name).exists():  # what lies in /tmp for days may be tidied away
+                with contextlib.suppress(ConfigError):  # then the process says that it finds no plan
+                    self.folder.write_plan(spec.name, text)
+
         self.processes[spec.name] = SupervisedProcess(
             spec,
             self._command(spec, self.folder),
@@ -152,7 +160,7 @@ class Supervisor:
             groups=self._groups,
             on_event=self._tell,
             may_start=lambda: self._gate_open,
-            before_start=self._clean,
+            before_start=before_start,
         )
 
     def _clean(self, removed: Sequence[str] = ()) -> None:

@@ -137,6 +137,8 @@ def _process_row(process: Mapping[str, Any], cpu: Mapping[int, float] | None) ->
     says = [f"{len(process['components'])} components" + (f", {idle} of them idle" if idle else "")]
     says += [f"{starting} of them not ready to serve yet"] if starting else []
     says += process["warnings"]
+    if process.get("log_lost"):
+        says.append(f"log: {process['log_lost']} bytes could not be written")
     if process["last_death"]:
         says.append(f"last death: {process['last_death']}")
     return {

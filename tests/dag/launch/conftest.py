@@ -31,13 +31,13 @@ def run_base(tmp_path, monkeypatch):
 
 @pytest.fixture
 def start(run_base, tmp_path, monkeypatch):
-    """Starts a node with the command's arguments."""
+    """Starts a node with the command's arguments, by a command `before` that runs it in another way."""
     nodes = []
 
-    def start(*arguments, **environment):
+    def start(*arguments, before=(), **environment):
         paths = [str(PARTS), *filter(None, [os.environ.get("PYTHONPATH")])]
         variables = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), **environment}
-        nodes.append(Node(arguments, variables, tmp_path))
+        nodes.append(Node(arguments, variables, tmp_path, before))
         return nodes[-1]
 
     yield start

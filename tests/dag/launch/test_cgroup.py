@@ -100,10 +100,23 @@ def test_a_limit_that_is_not_permitted_is_told_and_the_process_joins_all_the_sam
     assert (tmp_path / "app" / "cpu.max").exists() == (refused != "cgroup.subtree_control")
 
 
+def test_a_controller_that_the_system_does_not_have_is_named(tmp_path):
+    (tmp_path / "cgroup.controllers").write_text("cpu hugetlb\n")
+    groups = ControlGroups(tmp_path, "/")
+    told = f"memory.max: {tmp_path} has no controller memory (cgroup.controllers). Way out: let the group above"
+    assert groups.missing(LIMITS).startswith(told)
+    (warning,) = groups.join("app", 4711, LIMITS)
+    assert f"cgroup app: the process runs without limits: {told}" in warning
+    assert not (tmp_path / "cgroup.subtree_control").exists()
+    assert (tmp_path / "app" / "cgroup.procs").read_text() == "4711\n"
+    assert groups.missing(LimitsSpec(cpu_max=1)) is None
+    assert groups.missing(LimitsSpec()) is None
+
+
 def test_looking_whether_groups_can_be_made_changes_nothing(tmp_path):
     assert ControlGroups(tmp_path, "/").refusal() is None
     assert list(tmp_path.iterdir()) == []
-    assert "none: not permitted. Way out: a systemd unit" in ControlGroups(tmp_path, "/none").refusal()
+    assert "none: there is no such group. Way out: a systemd unit" in ControlGroups(tmp_path, "/none").refusal()
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 import asyncio
 import json
+import os
 import socket
 import stat
 
 import pytest
 
-from warploom.dag.launch.control import ControlClient, ControlServer
+from warploom.dag.launch.control import ControlClient, ControlServer, connect
 from warploom.errors import ConfigError, WarploomError
 
 
@@ -139,3 +140,10 @@ def test_a_socket_that_cannot_be_made_is_told(tmp_path):
     server = ControlServer(tmp_path / "none" / "c.sock", {})
     with pytest.raises(ConfigError, match="the control socket cannot be made"):
         asyncio.run(server.open())
+
+
+def test_who_may_not_look_into_the_folder_of_the_nodes_is_told_so(run_base, monkeypatch):
+    run_base.mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: path != run_base)
+    with pytest.raises(ConfigError, match="is not readable for this user: ask as the user who runs the node"):
+        connect()

@@ -1,5 +1,6 @@
 """The folder of a node at run time, and the logs in it."""
 
+import shutil
 import stat
 
 import pytest
@@ -73,3 +74,18 @@ def test_what_cannot_be_written_is_counted(tmp_path):
     log.write(b"12345")
     log.write(b"678")
     assert log.lost == 8
+
+
+def test_a_plan_that_was_tidied_away_is_written_again(run_base):
+    folder = RunFolder("n")
+    folder.open()
+    shutil.rmtree(folder.path / "plan")
+    folder.write_plan("p", "{}")
+    assert folder.plan("p").read_text() == "{}"
+    folder.plan("q").mkdir()
+    with pytest.raises(
+        ConfigError, match=r"n: cannot be written: Is a directory; make room there, or set WARPLOOM_RUN"
+    ):
+        folder.write_plan("q", "{}")
+    folder.plan("q").rmdir()
+    folder.close()

@@ -321,3 +321,16 @@ def test_a_supervision_that_fails_itself_ends_the_node(run, monkeypatch):
     code = one.through().code
     assert code == 1
     assert "its supervision failed: RuntimeError: our own mistake" in one.find("ended")[0]["reason"]
+
+
+def test_a_plan_that_was_tidied_away_is_there_again_for_the_next_life(run):
+    def scenario(node):
+        node.wait_for("up")
+        plan = node.supervisor.folder.plan("a")
+        text = plan.read_text()
+        plan.unlink()
+        os.kill(node.ask("ps")["processes"][0]["pid"], signal.SIGKILL)
+        node.wait_for("state", 2, state="running")
+        assert plan.read_text() == text
+
+    assert run({"a": "good"}).through(scenario).code == 0

@@ -18,12 +18,12 @@ TIMEOUT = 60.0  # for what takes a second on a machine that does nothing else
 class Node:
     """A supervisor in a process of its own, and what it told."""
 
-    def __init__(self, arguments, environment, cwd):
+    def __init__(self, arguments, environment, cwd, before=()):
         self.environment = environment
         self.events = []
         self._changed = threading.Condition()
         self._ended = False
-        command = [sys.executable, "-P", "-c", "from warploom.cli import main; main()", *map(str, arguments)]
+        command = [*before, sys.executable, "-P", "-c", "from warploom.cli import main; main()", *map(str, arguments)]
         self.supervisor = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=cwd,
             start_new_session=True,
