@@ -26,6 +26,7 @@ __all__ = [
     "LidarCard",
     "ModelCard",
     "OutputSpec",
+    "SecondSpec",
     "default_card",
     "file_sha256",
     "load_card",
@@ -42,6 +43,12 @@ EIGHT_BITS_CARD = DEFAULT_CARD.with_name("pillar_center_int8.yaml")
 _HIGHEST_OPSET = 17
 _REGRESSION = ("dx", "dy", "z", "log_l", "log_w", "log_h", "cos_2yaw", "sin_2yaw", "cos_yaw", "sin_yaw")
 _OVERLAP = "iou"
+
+
+def _name_of_file(value: str) -> str:
+    if value != Path(value).name or value in ("", ".", ".."):
+        raise ValueError(f"must be the name of a file beside the card, not {value!r}")
+    return value
 
 
 class _Strict(BaseModel):
@@ -108,6 +115,43 @@ class DecodeSpec(_Strict):
     max_objects: int = Field(ge=1)
 
 
+class SecondSpec(_Strict):
+    """The second stage: a network that looks at the points of the first one's boxes, see `models.second_stage`."""
+
+    file: str
+    """The ONNX file, beside the card."""
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    opset: int = Field(ge=11, le=_HIGHEST_OPSET)
+    points_of_box: int = Field(128, ge=1, le=4096)
+    """Points that it sees of a box."""
+    max_boxes: int = Field(64, ge=1, le=1024)
+    """Boxes of a cloud that it looks at, those with the best scores; what remains is dropped."""
+    candidate_score: float = Field(0.15, ge=0, le=1)
+    """Least score of the first stage of a box that it looks at."""
+    around: float = Field(0.75, ge=0)
+    """By which a box is grown on its sides to have its points [m], and in height as follows."""
+    over_bottom: float = 0.1
+    """From how far above its bottom [m]."""
+    over_top: float = 1.0
+    """Up to how far above its top [m]."""
+    moved: tuple[str, ...] = ()
+    """Classes whose boxes are put where the second stage says; of others it says score and class alone."""
+    weights: tuple[float, float, float] = (0.4, 0.4, 0.2)
+    """Exponents in a score of the first stage's, of the class's probability, and of the thought overlap."""
+
+    @field_validator("file")
+    @classmethod
+    def _beside_the_card(cls, value: str) -> str:
+        return _name_of_file(value)
+
+    @field_validator("weights")
+    @classmethod
+    def _shares(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if min(value) < 0 or abs(sum(value) - 1) > 1e-6:
+            raise ValueError(f"must be at least 0 and add up to 1, not {value}")
+        return value
+
+
 class ModelCard(_Strict):
     """What every card says, whatever its network takes and gives."""
 
@@ -128,9 +172,7 @@ class ModelCard(_Strict):
     @field_validator("file")
     @classmethod
     def _beside_the_card(cls, value: str) -> str:
-        if value != Path(value).name or value in ("", ".", ".."):
-            raise ValueError(f"must be the name of a file beside the card, not {value!r}")
-        return value
+        return _name_of_file(value)
 
     def contradiction(self) -> str:
         """What in it does not fit together; empty: nothing."""
@@ -156,6 +198,7 @@ class HeadCard(LidarCard):
     input: InputSpec
     output: OutputSpec
     decode: DecodeSpec
+    second: SecondSpec | None = None
 
     def contradiction(self) -> str:
         """What in it does not fit together."""
@@ -172,7 +215,34 @@ class HeadCard(LidarCard):
             return f"decode.refine names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
         if self.decode.overlap_weight and not self.output.overlap:
             return f"decode.overlap_weight is {self.decode.overlap_weight}, but output.regression has no {_OVERLAP}"
+        if self.second is not None:
+            if unknown := [name for name in self.second.moved if name not in self.classes]:
+                return f"second.moved names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
+            if self.second.file == self.file:
+                return f"second.file is the first stage's, {self.file}"
         return ""
+
+
+def _check_model(path: Path, file: str, sha256: str, wanted_opset: int) -> None:
+    """Refuses an ONNX file that is not the one that a card means."""
+    model = path.parent / file
+    if not model.is_file():
+        raise ModelError(f"{path}: the card's model {model} is not there; put the ONNX file beside its card")
+    found = file_sha256(model)
+    if found != sha256:
+        raise ModelError(
+            f"{model}: its sha256 is {found}, but the card {path.name} says {sha256}; "
+            "the file was changed or is another one: fetch it again, or write a card for it"
+        )
+    content = model.read_bytes()
+    try:
+        found_opset, elsewhere = opset(content), external_data(content)
+    except NotOnnxError as error:
+        raise ModelError(f"{model}: this is not an ONNX model: {error}") from error
+    if found_opset != wanted_opset:
+        raise ModelError(f"{model}: its opset is {found_opset}, but the card {path.name} says {wanted_opset}")
+    if elsewhere:
+        raise ModelError(f"{model}: its weights lie in other files, which the card's sha256 does not cover")
 
 
 Card = TypeVar("Card", bound=ModelCard)
@@ -240,25 +310,10 @@ def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[Model
         raise ModelError(f"{path}: the card is not valid: {reasons}") from error
     if contradiction := card.contradiction():
         raise ModelError(f"{path}: {contradiction}")
-    model = path.parent / card.file
-    if not model.is_file():
-        raise ModelError(f"{path}: the card's model {model} is not there; put the ONNX file beside its card")
-    found = file_sha256(model)
-    if found != card.sha256:
-        raise ModelError(
-            f"{model}: its sha256 is {found}, but the card {path.name} says {card.sha256}; "
-            "the file was changed or is another one: fetch it again, or write a card for it"
-        )
-    content = model.read_bytes()
-    try:
-        found_opset, elsewhere = opset(content), external_data(content)
-    except NotOnnxError as error:
-        raise ModelError(f"{model}: this is not an ONNX model: {error}") from error
-    if found_opset != card.opset:
-        raise ModelError(f"{model}: its opset is {found_opset}, but the card {path.name} says {card.opset}")
-    if elsewhere:
-        raise ModelError(f"{model}: its weights lie in other files, which the card's sha256 does not cover")
-    return card, model
+    _check_model(path, card.file, card.sha256, card.opset)
+    if isinstance(card, HeadCard) and card.second is not None:
+        _check_model(path, card.second.file, card.second.sha256, card.second.opset)
+    return card, path.parent / card.file
 
 
 def save_card(path: str | Path, card: ModelCard) -> None:

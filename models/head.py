@@ -1,7 +1,8 @@
 """The pillar centre head at work: points in, boxes with class and score out.
 
 Pillars, network and decoding each have one buffer for life: our kernel writes the network's input, ONNX Runtime
-writes its output, both where they lie, and our kernels turn the maps into boxes.
+writes its output, both where they lie, and our kernels turn the maps into boxes. Where the card has a second stage,
+these are candidates, which it looks at again.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from .card import HeadCard, default_card, load_card
 from .classes import CLASSES
 from .detections import Detections
 from .network import PRECISIONS, PROVIDERS, Network
+from .second_stage import SecondStage
 
 __all__ = ["PRECISIONS", "PROVIDERS", "DetectionHead"]
 
@@ -34,7 +36,7 @@ _log = logging.getLogger(__name__)
 class _Slot:
     """The kernels and buffers of one cloud of a batch."""
 
-    def __init__(self, card: HeadCard, capacity: int, device: str):
+    def __init__(self, card: HeadCard, capacity: int, device: str, refined: bool):
         decode = card.decode
         self.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.pillars = PillarGrid(
@@ -67,9 +69,12 @@ class _Slot:
                 size=(high[0] - low[0], high[1] - low[1]),
                 device=device,
             )
-            if decode.refine
+            if refined and decode.refine
             else None
         )
+        self.found = (self.decode.boxes, self.decode.scores, self.decode.classes_found)
+        self.kept = self.nms
+        self.dropped = [self.decode.dropped, self.nms.dropped]
 
 
 class DetectionHead:
@@ -87,11 +92,12 @@ class DetectionHead:
         score_threshold: Least score of a detection; None is the card's.
         capacity: Most points of a cloud.
         batch: Clouds that `detect_batch` runs at once.
+        candidates_only: Say what the first stage finds, neither seen by the second one nor refined.
 
     Attributes:
         provider: Where the network runs, one of `PROVIDERS`.
         fallback: Empty where that is the first choice; else what is missing.
-        overflow: Objects that the last cloud had beyond the card's `max_candidates` or `max_objects`.
+        overflow: Objects that the last cloud had beyond the card's `max_candidates`, `max_objects` or `max_boxes`.
 
     Raises:
         ModelError: The card or its model is missing, not valid, or the two do not fit.
@@ -108,6 +114,7 @@ class DetectionHead:
         score_threshold: float | None = None,
         capacity: int = 1 << 18,
         batch: int = 1,
+        candidates_only: bool = False,
     ):
         if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
             raise ValueError(f"score_threshold must be in [0, 1], not {score_threshold}")
@@ -135,7 +142,26 @@ class DetectionHead:
             classes=self.card.classes,
         )
         self.provider, self.fallback = self._network.provider, self._network.fallback
-        self._slots = [_Slot(self.card, capacity, self.device) for _ in range(batch)]
+        self._slots = [_Slot(self.card, capacity, self.device, not candidates_only) for _ in range(batch)]
+        self._second = None
+        self._least = self.score_threshold
+        if self.card.second is not None and not candidates_only:
+            self._least = self.card.second.candidate_score
+            self._second = SecondStage(
+                self.card,
+                model.parent,
+                device=self.device,
+                threads=threads,
+                precision=precision,
+                providers=providers,
+                capacity=capacity,
+                batch=batch,
+            )
+            for row, slot in enumerate(self._slots):
+                look = self._second.look(row)
+                slot.found = (look.rescore.boxes_out, look.rescore.scores, look.rescore.kinds)
+                slot.kept = look.nms
+                slot.dropped += [look.rescore.dropped, look.nms.dropped]
         self._maps = wp.zeros((batch, *self.card.output.shape[1:]), dtype=wp.float32, device=self.device)
         # One cloud's grid is read where our kernel draws it; those of several are gathered into one array.
         self._grids = (
@@ -217,26 +243,30 @@ class DetectionHead:
 
     def _find(self, clouds: list[tuple[wp.array, wp.array, float | wp.array]]) -> None:
         for row, (slot, cloud) in enumerate(zip(self._slots, clouds, strict=False)):
-            slot.decode.launch(self._maps[row : row + 1], self.score_threshold, cloud[2])
+            slot.decode.launch(self._maps[row : row + 1], self._least, cloud[2])
             slot.nms.launch(slot.decode.boxes, slot.decode.scores, slot.decode.count)
+        if self._second is not None:
+            self._second.launch(clouds, [(slot.decode, slot.nms) for slot in self._slots], self.score_threshold)
+        for slot, cloud in zip(self._slots, clouds, strict=False):
             if slot.refine is not None:
-                found = (slot.decode.boxes, slot.decode.classes_found, slot.nms.keep, slot.nms.keep_count)
-                slot.refine.launch(cloud[0], cloud[1], *found)
+                boxes, _, kinds = slot.found
+                slot.refine.launch(cloud[0], cloud[1], boxes, kinds, slot.kept.keep, slot.kept.keep_count)
 
     def _read(self, slot: _Slot) -> Detections:
-        kept = int(slot.nms.keep_count.numpy()[0])
-        dropped = int(slot.decode.dropped.numpy()[0]) + int(slot.nms.dropped.numpy()[0])
+        kept = int(slot.kept.keep_count.numpy()[0])
+        dropped = sum(int(count.numpy()[0]) for count in slot.dropped)
         if dropped:
             self.overflow += dropped
             _log.warning("%s: %d detections beyond the card's limits were dropped", self.card.name, dropped)
         if kept == 0:
             return Detections.empty()
-        keep = slot.nms.keep.numpy()[:kept]
-        keep = keep[~_holds_the_sensor(slot.decode.boxes.numpy()[keep])]
+        boxes, scores, kinds = (array.numpy() for array in slot.found)
+        keep = slot.kept.keep.numpy()[:kept]
+        keep = keep[~_holds_the_sensor(boxes[keep])]
         return Detections(
-            boxes=slot.decode.boxes.numpy()[keep],
-            scores=slot.decode.scores.numpy()[keep],
-            classes=self._class_indices[slot.decode.classes_found.numpy()[keep]],
+            boxes=boxes[keep],
+            scores=scores[keep],
+            classes=self._class_indices[kinds[keep]],
             velocities=np.full((len(keep), 2), np.nan, np.float32),
             background=np.zeros(len(keep), bool),
         )

@@ -1,0 +1,158 @@
+"""Boxes as a second look at their points has them: scores, classes, places and sizes from what a network said of each.
+
+The score is a weighted geometric mean of the first stage's score, the probability of the class, and how far the box is
+thought to overlap its object, as in CIA-SSD (Zheng et al., AAAI 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .device import resolve_device
+
+__all__ = ["RESIDUALS", "BoxRescore"]
+
+RESIDUALS = ("dx", "dy", "dz", "log_l", "log_w", "log_h", "dyaw")
+"""In the box's frame: of the centre, as parts of the diagonal seen from above and of the height; of the sizes, as
+logarithms of ratios; of the heading [rad]."""
+
+_MOST = wp.constant(1.0)  # of a residual; what is larger is no small correction
+
+
+@wp.kernel
+def _rescore(
+    # in
+    boxes_in: wp.array2d(dtype=wp.float32),
+    scores_in: wp.array(dtype=wp.float32),
+    keep_in: wp.array(dtype=wp.int32),
+    keep_count_in: wp.array(dtype=wp.int32),
+    said_in: wp.array2d(dtype=wp.float32),
+    moved_in: wp.array(dtype=wp.int32),
+    first_weight: float,
+    class_weight: float,
+    overlap_weight: float,
+    least: float,
+    # out
+    boxes_out: wp.array2d(dtype=wp.float32),
+    scores_out: wp.array(dtype=wp.float32),
+    kinds_out: wp.array(dtype=wp.int32),
+    count_out: wp.array(dtype=wp.int32),
+    dropped_out: wp.array(dtype=wp.int32),
+):
+    """One thread a box; the first also counts those that nobody looks at though their score would do."""
+    k = wp.tid()
+    most = scores_out.shape[0]
+    if k == 0:
+        count_out[0] = wp.min(keep_count_in[0], most)
+        dropped = int(0)
+        for other in range(most, keep_count_in[0]):
+            if scores_in[keep_in[other]] >= least:
+                dropped += 1
+        dropped_out[0] = dropped
+    if k >= keep_count_in[0]:
+        return
+    b = keep_in[k]
+    kinds = moved_in.shape[0]
+    best = int(1)
+    highest = said_in[k, 0]
+    for kind in range(1, kinds + 1):
+        if said_in[k, kind] > said_in[k, best]:
+            best = kind
+        highest = wp.max(highest, said_in[k, kind])
+    whole = float(0.0)
+    for kind in range(kinds + 1):
+        whole += wp.exp(said_in[k, kind] - highest)
+    probability = wp.exp(said_in[k, best] - highest) / whole
+    overlap = 1.0 / (1.0 + wp.exp(-said_in[k, kinds + 1]))
+    score = wp.pow(scores_in[b], first_weight) * wp.pow(probability, class_weight) * wp.pow(overlap, overlap_weight)
+    # NaN, which suppression leaves out.
+    scores_out[k] = wp.where(score >= least, score, wp.nan)
+    kinds_out[k] = best - 1
+    for value in range(7):
+        boxes_out[k, value] = boxes_in[b, value]
+    if moved_in[best - 1] == 0:
+        return
+    first = kinds + 2
+    c = wp.cos(boxes_in[b, 6])
+    s = wp.sin(boxes_in[b, 6])
+    diagonal = wp.sqrt(boxes_in[b, 3] * boxes_in[b, 3] + boxes_in[b, 4] * boxes_in[b, 4])
+    along = wp.clamp(said_in[k, first], -_MOST, _MOST) * diagonal
+    across = wp.clamp(said_in[k, first + 1], -_MOST, _MOST) * diagonal
+    boxes_out[k, 0] = boxes_in[b, 0] + along * c - across * s
+    boxes_out[k, 1] = boxes_in[b, 1] + along * s + across * c
+    boxes_out[k, 2] = boxes_in[b, 2] + wp.clamp(said_in[k, first + 2], -_MOST, _MOST) * boxes_in[b, 5]
+    for size in range(3):
+        boxes_out[k, 3 + size] = boxes_in[b, 3 + size] * wp.exp(wp.clamp(said_in[k, first + 3 + size], -_MOST, _MOST))
+    yaw = boxes_in[b, 6] + wp.clamp(said_in[k, first + 6], -_MOST, _MOST)
+    boxes_out[k, 6] = wp.where(yaw > wp.PI, yaw - wp.TAU, wp.where(yaw < -wp.PI, yaw + wp.TAU, yaw))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxRescore:
+    """A plan: new boxes of up to `boxes` old ones.
+
+    Attributes:
+        boxes_out: Shape (boxes, 7), float32.
+        scores: Shape (boxes,), float32; NaN where a score is too low.
+        kinds: Shape (boxes,), int32.
+        count: How many they are, shape (1,), int32.
+        dropped: Boxes after the first `boxes` whose old score would do, shape (1,), int32.
+    """
+
+    boxes: int
+    """Boxes that one launch looks at."""
+    moved: Sequence[bool]
+    """Whether boxes of each class take the residuals too, in the order of the network."""
+    weights: tuple[float, float, float]
+    """Exponents of the old score, of the probability of the class, and of the overlap; they add up to 1."""
+    device: str = "cpu"
+    """A Warp device, such as `cpu` or `cuda:0`."""
+
+    def __post_init__(self):
+        if self.boxes < 1:
+            raise ValueError(f"boxes must be at least 1, not {self.boxes}")
+        if not len(self.moved):
+            raise ValueError("moved must say so of each class, not of none")
+        if not all(weight >= 0.0 for weight in self.weights) or abs(sum(self.weights) - 1.0) > 1e-6:
+            raise ValueError(f"weights must be at least 0 and add up to 1, not {self.weights}")
+        device = resolve_device(self.device)
+
+        def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
+            object.__setattr__(self, name, wp.zeros(shape, dtype=dtype, device=device))
+
+        moved = wp.array(np.asarray(self.moved, np.int32), dtype=wp.int32, device=device)
+        object.__setattr__(self, "_moved", moved)
+        buffer("boxes_out", (self.boxes, 7), wp.float32)
+        buffer("scores", self.boxes, wp.float32)
+        buffer("kinds", self.boxes, wp.int32)
+        buffer("count", 1, wp.int32)
+        buffer("dropped", 1, wp.int32)
+
+    def launch(
+        self, boxes: wp.array, scores: wp.array, keep: wp.array, keep_count: wp.array, said: wp.array, least: float
+    ) -> None:
+        """Fills `boxes_out`, `scores`, `kinds`, `count` and `dropped`.
+
+        Args:
+            boxes: Shape (b, 7), float32: x y z l w h yaw.
+            scores: Shape (b,), float32, in [0, 1].
+            keep: Which of them, the best first, shape (k,), int32.
+            keep_count: How many of these, shape (1,), int32.
+            said: Of each of the first `boxes` of those, shape (boxes, 1 + classes + 1 + 7), float32: logits of nothing
+                and of the classes, of the overlap, and the `RESIDUALS`.
+            least: Least new score.
+        """
+        wanted = (self.boxes, 2 + len(self.moved) + len(RESIDUALS))
+        if tuple(said.shape) != wanted:
+            raise ValueError(f"said must have the shape {wanted}, not {tuple(said.shape)}")
+        wp.launch(
+            _rescore,
+            min(self.boxes, keep.shape[0]),
+            inputs=[boxes, scores, keep, keep_count, said, self._moved, *map(float, self.weights), float(least)],
+            outputs=[self.boxes_out, self.scores, self.kinds, self.count, self.dropped],
+            device=self.scores.device,
+        )

@@ -1,0 +1,165 @@
+"""The second stage of a head: a small network looks at the points of each candidate and says what it is and where.
+
+A first stage sees cells of a quarter of a metre; a person's shape, or what a wall lacks of a car, is in the points. The
+candidates' points are gathered by our kernel where ONNX Runtime reads them, and another makes boxes of what it says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import warp as wp
+
+from ..errors import ModelError
+from ..kernels.box_points import BOX_CHANNELS, POINT_CHANNELS, BoxPoints
+from ..kernels.box_rescore import RESIDUALS, BoxRescore
+from ..kernels.decode import CenterDecode
+from ..kernels.nms import RotatedNms
+from .card import HeadCard, SecondSpec
+from .network import Network
+
+__all__ = ["SecondStage"]
+
+
+class _Look:
+    """The kernels of one cloud of a batch, and its rows of what the network reads and writes."""
+
+    def __init__(self, card: HeadCard, spec: SecondSpec, capacity: int, arrays: Sequence[wp.array], device: str):
+        low, high = card.input.point_range[:2], card.input.point_range[3:5]
+        self.arrays = arrays
+        self.gather = BoxPoints(
+            capacity=capacity,
+            boxes=spec.max_boxes,
+            points_of_box=spec.points_of_box,
+            classes=len(card.classes),
+            around=spec.around,
+            over_bottom=spec.over_bottom,
+            over_top=spec.over_top,
+            origin=low,
+            size=(high[0] - low[0], high[1] - low[1]),
+            points=arrays[0],
+            described=arrays[1],
+            device=device,
+        )
+        self.rescore = BoxRescore(
+            boxes=spec.max_boxes,
+            moved=tuple(name in spec.moved for name in card.classes),
+            weights=spec.weights,
+            device=device,
+        )
+        self.nms = RotatedNms(
+            capacity=spec.max_boxes,
+            threshold=card.decode.nms_iou,
+            max_output=min(spec.max_boxes, card.decode.max_objects),
+            device=device,
+        )
+
+
+class SecondStage:
+    """The second stage of a card, loaded and bound to its buffers.
+
+    Args:
+        card: With `second`.
+        folder: Where the card is.
+        device: Where the kernels run.
+        threads: CPU threads of the network.
+        precision: As of `network.Network`.
+        providers: As of `network.Network`.
+        capacity: Most points of a cloud.
+        batch: Clouds at once.
+
+    Raises:
+        ModelError: The network does not fit the card.
+    """
+
+    def __init__(
+        self,
+        card: HeadCard,
+        folder: Path,
+        *,
+        device: str,
+        threads: int,
+        precision: str,
+        providers: Sequence[str] | None,
+        capacity: int,
+        batch: int,
+    ):
+        assert card.second is not None
+        self._spec = spec = card.second
+        model, rows = folder / spec.file, spec.max_boxes
+        inputs = {
+            "points": (spec.points_of_box, len(POINT_CHANNELS)),
+            "boxes": (len(BOX_CHANNELS) + len(card.classes),),
+        }
+        outputs = {"said": (2 + len(card.classes) + len(RESIDUALS),)}
+        self._network = Network(
+            model,
+            {name: (None, *shape) for name, shape in inputs.items()},
+            {name: (None, *shape) for name, shape in outputs.items()},
+            device=device,
+            threads=threads,
+            precision=precision,
+            providers=providers,
+            classes=card.classes,
+        )
+        self.provider, self.fallback = self._network.provider, self._network.fallback
+        self._whole = {
+            name: wp.zeros((batch * rows, *shape), dtype=wp.float32, device=device)
+            for name, shape in (inputs | outputs).items()
+        }
+        self._looks = [
+            _Look(card, spec, capacity, [a[k * rows : (k + 1) * rows] for a in self._whole.values()], device)
+            for k in range(batch)
+        ]
+        # On a CPU it is known how many candidates there are, and the network looks at no more.
+        self._counted = device == "cpu"
+        self._bind(list(self._whole.values()))
+        try:
+            self._network.run()
+        except Exception as error:  # ONNX Runtime has a family of exceptions of its own, not all of them public
+            raise ModelError(f"{model}: it does not take {batch * rows} candidates at once: {error}") from error
+
+    def look(self, row: int) -> _Look:
+        """The kernels of a cloud of the batch: its boxes are in `rescore`, of which those that stay are in `nms`."""
+        return self._looks[row]
+
+    def _bind(self, arrays: Sequence[wp.array]) -> None:
+        self._network.bind_input("points", arrays[0])
+        self._network.bind_input("boxes", arrays[1])
+        self._network.bind_output("said", arrays[2])
+
+    def launch(
+        self,
+        clouds: Sequence[tuple[wp.array, wp.array, float | wp.array]],
+        found: Sequence[tuple[CenterDecode, RotatedNms]],
+        score_threshold: float,
+    ) -> None:
+        """Looks at the candidates of one or more clouds.
+
+        Args:
+            clouds: Positions, their number and the sensor's height, as in `DetectionHead.detect`.
+            found: Candidates of each, and which of them stay.
+            score_threshold: Least score of an object.
+        """
+        for look, cloud, (decode, nms) in zip(self._looks, clouds, found, strict=False):
+            look.gather.launch(
+                cloud[0],
+                cloud[1],
+                decode.boxes,
+                decode.scores,
+                decode.classes_found,
+                nms.keep,
+                nms.keep_count,
+                cloud[2],
+            )
+            if self._counted:
+                count = min(int(nms.keep_count.numpy()[0]), self._spec.max_boxes)
+                if count:
+                    self._bind([array[:count] for array in look.arrays])
+                    self._network.run()
+        if not self._counted:
+            self._network.run()
+        for look, (decode, nms) in zip(self._looks, found, strict=False):
+            look.rescore.launch(decode.boxes, decode.scores, nms.keep, nms.keep_count, look.arrays[2], score_threshold)
+            look.nms.launch(look.rescore.boxes_out, look.rescore.scores, look.rescore.count)
