@@ -34,8 +34,11 @@ def profile(
     from rich.console import Console
 
     from ..components.machine import machine_lines
+    from ..components.profile import load_profile
     from ..components.profiling import look, measure_profile, propose, verdict_lines
 
+    if name is not None:  # a wrong name is told before the machine is looked at
+        load_profile(name)
     progress = Console(stderr=True)
     with progress.status("looking at the machine"):
         machine = look()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,11 +30,15 @@ __all__ = [
     "check_memory",
     "check_models",
     "check_ports",
+    "check_recordings",
     "check_remote",
     "check_sensors",
+    "check_settings",
 ]
 
 _GIB = 2**30
+_ROOM_BYTES = 64 << 20
+"""Of a disk that a recording may be begun on [B]."""
 
 
 def _profile_of(plan: LaunchPlan) -> ConfigFile[Profile] | None:
@@ -213,11 +218,20 @@ def check_sensors(plan: LaunchPlan) -> Iterator[Finding]:
     for process, component in _components(plan):
         if "sensor" not in component.config:
             continue
-        driver = _driver_of(component)
+        from .node.lidar import LidarDriver
+
+        driver = _class_of(component, LidarDriver)
         if driver is None:
             continue
         who = f"{process}/{component.name}"
         name = component.config["sensor"]
+        lidars = [] if file is None else [one.name for one in file.content.sensors.get("lidar", ())]
+        if lidars and file is not None and name not in lidars:
+            yield Finding(
+                "sensors", False, f"{who}: the profile has no lidar {name!r}; {nearest(str(name), lidars)}",
+                f"correct its name in {file.path}, or --set {component.name}.sensor={lidars[0]}",
+            )  # fmt: skip
+            continue
         uri = _source_of(driver, component, sensors.get(name), file)
         if uri is None:
             continue
@@ -226,16 +240,15 @@ def check_sensors(plan: LaunchPlan) -> Iterator[Finding]:
         yield Finding("sensors", why is None, f"{who}: {uri}{f': {why}' if why else ''}", way_out if why else "")
 
 
-def _driver_of(component: ComponentSpec) -> Any:
-    """The class of a component that drives a sensor; None where it is none."""
+def _class_of(component: ComponentSpec, base: type) -> Any:
+    """The class of a component, where it is one of a kind; None otherwise."""
     from ..dag import import_class
-    from .node.lidar import LidarDriver
 
     try:
         found = import_class(component.class_name) if component.class_name else None
     except ConfigError:  # building the process says it
         return None
-    return found if found is not None and issubclass(found, LidarDriver) else None
+    return found if isinstance(found, type) and issubclass(found, base) else None
 
 
 def _source_of(driver: Any, component: ComponentSpec, sensor: Any, file: ConfigFile[Profile] | None) -> str | None:
@@ -309,11 +322,51 @@ def check_remote(plan: LaunchPlan) -> Iterator[Finding]:
             yield Finding("remote", False, message, f"correct it in remote of {plan.file.path}, or take it out")
 
 
+def check_recordings(plan: LaunchPlan) -> Iterator[Finding]:
+    """Can what is to be recorded be written, and is there room?"""
+    from .node.recorder import TopicRecorder
+
+    for process, component in _components(plan):
+        path = component.config.get("path")
+        if not isinstance(path, str) or _class_of(component, TopicRecorder) is None:
+            continue
+        who = f"{process}/{component.name}"
+        folder = Path(path).absolute().parent
+        while not folder.exists():  # it is made
+            folder = folder.parent
+        free = shutil.disk_usage(folder).free
+        why = None
+        if not folder.is_dir():
+            why = "is no folder"
+        elif not os.access(folder, os.W_OK | os.X_OK):
+            why = "is not writable for this user, or mounted read-only"
+        elif free < _ROOM_BYTES:
+            why = f"has {free / 2**20:.0f} MiB left: a LiDAR fills that within seconds"
+        message = f"{who}: {folder} {why or f'has {free / _GIB:.1f} GiB left'}"
+        way_out = f"make room there, or --set {component.name}.path=… to another folder"
+        yield Finding("recordings", why is None, message, way_out if why else "")
+
+
+def check_settings(plan: LaunchPlan) -> Iterator[Finding]:
+    """Which settings of the profile are for no component of the node? They are left out, so that nothing is missing."""
+    file = _profile_of(plan)
+    if file is None:
+        return
+    known = {one.name for _, one in _components(plan)}
+    for key in file.content.settings:
+        name = key.partition(".")[0]
+        if name not in known:
+            said = f"{key} of {file.path} is left out: the node has no component {name!r}; {nearest(name, known)}"
+            yield Finding("settings", True, said)
+
+
 register_check("device", check_device)
 register_check("backend", check_backends)
 register_check("memory", check_memory)
 register_check("models", check_models)
 register_check("ports", check_ports)
 register_check("sensors", check_sensors)
+register_check("recordings", check_recordings)
 register_check("remote", check_remote)
 register_check("cgroups", check_groups)
+register_check("settings", check_settings)

@@ -122,7 +122,10 @@ class TopicRecorder(Component):
     @property
     def idle_because(self) -> str | None:
         """Why nothing is recorded; None while something is."""
-        return None if self.inputs else "its inputs name no topic"
+        if not self.inputs:
+            return "its inputs name no topic"
+        failure = None if self._recorder is None else self._recorder.failure
+        return None if failure is None else f"the recording broke off: {failure}"
 
     def state(self) -> dict[str, str | float | int]:
         """The file, and how many commits are in it or were lost."""
@@ -136,8 +139,6 @@ class TopicRecorder(Component):
             said["gaps"] = self._gaps
         if lost:
             said["lost"] = lost
-        if self._recorder.failure is not None:
-            said["broke off"] = self._recorder.failure
         return said
 
 

@@ -15,6 +15,7 @@ from warploom.components.preflight import (
     check_ports,
     check_remote,
     check_sensors,
+    check_settings,
 )
 from warploom.components.profile import load_profile
 from warploom.dag import load_module
@@ -193,6 +194,19 @@ def test_a_sensor_that_nobody_can_play_is_told(plan, profile, more, said):
     found = one(check_sensors(plan(profile, more=more)), False)
     assert said in found
     assert "name another source for sensor 'roof'" in found
+
+
+def test_a_sensor_whose_name_is_not_that_of_the_profile_is_told(plan):
+    said = one(check_sensors(plan("sensors: {lidar: [{name: rof, mounting: {xyz: [1, 0, 2]}}]}")), False)
+    assert "process/driver: the profile has no lidar 'roof'; did you mean 'rof'?" in said
+    assert "--set driver.sensor=rof" in said
+    assert one(check_sensors(plan("sensors: {radar: [{name: rof}]}")), True), "a profile without a lidar is for any"
+
+
+def test_settings_of_the_profile_for_nothing_in_the_node_are_told(plan):
+    said = one(check_settings(plan("settings: {drivr.rate_hz: 5, driver.rate_hz: 5}")), True)
+    assert "drivr.rate_hz of " in said
+    assert "p.yaml is left out: the node has no component 'drivr'; did you mean 'driver'?" in said
 
 
 def test_the_simulator_is_looked_at_but_not_built(plan, monkeypatch):

@@ -195,5 +195,13 @@ def test_it_can_only_look(monkeypatch):
     assert json.loads(done.stdout)["measurement"] is None
 
 
+def test_a_profile_that_there_is_not_is_told_before_the_machine_is_looked_at(monkeypatch):
+    monkeypatch.setattr(profiling, "look", lambda: pytest.fail("it takes a second"))
+    for more in ([], ["--no-measure"]):
+        done = CliRunner().invoke(app, ["profile", "cup", *more])
+        assert "no profile 'cup'" in str(done.exception)
+        assert "did you mean 'cpu'?" in str(done.exception)
+
+
 def test_its_help_shows_an_example():
     assert "warploom profile --seconds 10" in CliRunner().invoke(app, ["profile", "--help"]).stdout

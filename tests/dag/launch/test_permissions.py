@@ -1,6 +1,7 @@
-"""What the system does not permit, tried by a user who is not root: it is told, and nothing half-starts."""
+"""What the system does not permit, or has no room for, tried by who is not root: told, and nothing half-starts."""
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -11,6 +12,8 @@ from launch_nodes import PLAIN, TICKER
 from launch_users import as_user, give, with_mount
 
 from warploom.dag.launch.cgroup import ControlGroups
+from warploom.datamesh.recording import EventKind
+from warploom.datamesh.recording_reader import Recording
 
 METRICS = """\
 module: {name}
@@ -218,3 +221,49 @@ def test_a_run_folder_that_fills_up_in_between_starts_nothing(start, run_base, f
     before[-2] = before[-2].replace(" && exec", f" && dd if=/dev/zero of='{run_base}/filling' bs=4k count=2; exec")
     refused(start("launch", file, before=before), f"{run_base}/node: cannot be written: No space left on device")
     assert subprocess.run(["sh", "-c", f"mountpoint -q {run_base}"]).returncode != 0
+
+
+RECORDER = """\
+module: {name}
+components:
+  - name: {name}
+    kind: generic
+    class: warploom.components.node.recorder.TopicRecorder
+    config: {config}
+    inputs: {{any: ticks}}
+"""
+
+
+def test_a_disk_that_fills_up_ends_the_recording_and_nothing_else(start, module, launch_file, tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    before = with_mount(["-t", "tmpfs", "-o", "size=1m", "tmpfs"], folder)
+    recorder = module(RECORDER, "recorder", config=f"{{path: {folder}/run.mcap}}")
+    file = launch_file(one=[module(TICKER, "ticker", topic="ticks", size=20_000), recorder])
+    refused = start("launch", file, before=before)
+    assert refused.wait() == 2
+    assert f"MISSING  recordings: one/recorder: {folder} has 1 MiB left" in refused.errors
+    assert "→ make room there, or --set recorder.path=" in refused.errors
+    node = start("launch", file, "--skip-check", "recordings", before=before).up()
+
+    def recording():
+        return next(one for one in node.process("one")["components"] if one["name"] == "recorder")
+
+    why = node.wait_until(lambda: recording()["idle_because"])
+    assert why == "the recording broke off: No space left on device"
+    lost = recording()["state"]["lost"]
+    node.wait_until(lambda: recording()["state"]["lost"] > lost)  # what is committed from here on is counted
+    seen = Path(f"/proc/{node.process('one')['pid']}/root{folder}")  # as the process sees it
+    (path,) = (shutil.copy(one, tmp_path) for one in seen.iterdir())
+    assert len([event for event in Recording(path) if event.kind is EventKind.COMMIT]) > 0
+    assert node.process("one")["restarts"] == 0
+    assert node.stop() == 0
+
+
+def test_a_recording_where_this_user_may_not_write_is_told_and_nothing_starts(start, user, module, launch_file):
+    place = Path("/proc/recordings/run.mcap")  # where not even root may make a folder
+    recorder = module(RECORDER, "recorder", config=f"{{path: {place}}}")
+    node = start("launch", launch_file(one=[module(TICKER, "ticker", topic="ticks"), recorder]), before=user)
+    assert node.wait() == 2
+    assert "MISSING  recordings: one/recorder: /proc is not writable for this user" in node.errors
+    assert node.events == []
