@@ -37,6 +37,7 @@ bottom above the ground [m], the direction to the sensor in its frame, and its s
 _CELL = wp.constant(0.5)  # [m] edge of a cell of the map that tells whose a point may be
 _CPU_RUN = 4096
 _GPU_RUN = 256
+_MIX = wp.constant(wp.uint32(0x9E3779B1))
 _NEAREST = wp.constant(0.1)  # [m] of which a logarithm is taken at least
 _WIDTH = wp.constant(len(POINT_CHANNELS))
 _OF_BOX = wp.constant(len(BOX_CHANNELS))
@@ -53,8 +54,10 @@ def _local(pose: wp.vec4, x: float, y: float) -> wp.vec2:
 @wp.func
 def _holds(pose: wp.vec4, reach: wp.vec4, p: wp.vec3) -> bool:
     """Whether a grown box has a point; `reach`: half its length and width, its lowest and its highest z."""
+    if p[2] < reach[2] or not (p[2] <= reach[3]):
+        return False
     at = _local(pose, p[0], p[1])
-    return wp.abs(at[0]) <= reach[0] and wp.abs(at[1]) <= reach[1] and p[2] >= reach[2] and p[2] <= reach[3]
+    return wp.abs(at[0]) <= reach[0] and wp.abs(at[1]) <= reach[1]
 
 
 @wp.kernel
@@ -114,8 +117,19 @@ def _cell_of(p: wp.vec3, low_x: float, low_y: float, rows: int, columns: int) ->
     return wp.vec2i(-1, -1)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __ffs(bits) - 1;
+#else
+return __builtin_ctz(bits);
+#endif
+""")
+def _lowest(bits: wp.uint32) -> int:
+    """The number of the lowest bit that is set, of at least one."""
+
+
 @wp.kernel
-def _count(
+def _find(
     part: int,
     parts: int,
     # in
@@ -130,27 +144,36 @@ def _count(
     run: int,
     # out
     ranks_out: wp.array2d(dtype=wp.int32),
+    listed_out: wp.array(dtype=wp.int32),
+    list_out: wp.array(dtype=wp.int32),
+    bits_out: wp.array2d(dtype=wp.uint32),
 ):
-    """Counts the points that each run of them has in each box."""
+    """Lists the points of each run that are in boxes, each with the bits of its boxes, and counts those of each box."""
     for chunk in range(part + parts * wp.tid(), ranks_out.shape[0], parts * lanes):
         for k in range(ranks_out.shape[1]):
             ranks_out[chunk, k] = 0
+        slot = int(chunk * run)
         for i in range(chunk * run, wp.min((chunk + 1) * run, count_in[0])):
             p = xyz_in[i]
             cell = _cell_of(p, low_x, low_y, marks_in.shape[0], marks_in.shape[1])
             if cell[0] >= 0:
+                any_box = bool(False)
                 for word in range(marks_in.shape[2]):
                     bits = marks_in[cell[0], cell[1], word]
-                    k = int(word * 32)
+                    inside = wp.uint32(0)
                     while bits != wp.uint32(0):
-                        if (bits & wp.uint32(255)) == wp.uint32(0):
-                            bits = bits >> wp.uint32(8)
-                            k += 8
-                        else:
-                            if (bits & wp.uint32(1)) != wp.uint32(0) and _holds(pose_in[k], reach_in[k], p):
-                                ranks_out[chunk, k] = ranks_out[chunk, k] + 1
-                            bits = bits >> wp.uint32(1)
-                            k += 1
+                        bit = _lowest(bits)
+                        bits = bits & (bits - wp.uint32(1))
+                        k = word * 32 + bit
+                        if _holds(pose_in[k], reach_in[k], p):
+                            inside = inside | (wp.uint32(1) << wp.uint32(bit))
+                            ranks_out[chunk, k] = ranks_out[chunk, k] + 1
+                    bits_out[slot, word] = inside
+                    any_box = any_box or inside != wp.uint32(0)
+                if any_box:
+                    list_out[slot] = i
+                    slot += 1
+        listed_out[chunk] = slot
 
 
 @wp.kernel
@@ -223,7 +246,7 @@ def _slot_of(rank: int, total: int, room: int) -> int:
         return rank
     share = (rank * room + room - 1) / total
     first = share * total / room
-    mixed = (wp.uint32(share) + wp.uint32(1)) * wp.uint32(0x9E3779B1)
+    mixed = (wp.uint32(share) + wp.uint32(1)) * _MIX
     chosen = first + int((mixed >> wp.uint32(8)) % wp.uint32((share + 1) * total / room - first))
     return wp.where(rank == chosen, share, -1)
 
@@ -235,12 +258,10 @@ def _take(
     # in
     lanes: int,
     xyz_in: wp.array(dtype=wp.vec3),
-    count_in: wp.array(dtype=wp.int32),
-    marks_in: wp.array3d(dtype=wp.uint32),
     pose_in: wp.array(dtype=wp.vec4),
-    reach_in: wp.array(dtype=wp.vec4),
-    low_x: float,
-    low_y: float,
+    listed_in: wp.array(dtype=wp.int32),
+    list_in: wp.array(dtype=wp.int32),
+    bits_in: wp.array2d(dtype=wp.uint32),
     run: int,
     boxes_in: wp.array2d(dtype=wp.float32),
     keep_in: wp.array(dtype=wp.int32),
@@ -253,42 +274,34 @@ def _take(
 ):
     """Writes the points of each box, or of many an even choice."""
     for chunk in range(part + parts * wp.tid(), ranks.shape[0], parts * lanes):
-        for i in range(chunk * run, wp.min((chunk + 1) * run, count_in[0])):
-            p = xyz_in[i]
-            cell = _cell_of(p, low_x, low_y, marks_in.shape[0], marks_in.shape[1])
-            if cell[0] >= 0:
-                for word in range(marks_in.shape[2]):
-                    bits = marks_in[cell[0], cell[1], word]
-                    k = int(word * 32)
-                    while bits != wp.uint32(0):
-                        if (bits & wp.uint32(255)) == wp.uint32(0):
-                            bits = bits >> wp.uint32(8)
-                            k += 8
-                        else:
-                            if (bits & wp.uint32(1)) != wp.uint32(0) and _holds(pose_in[k], reach_in[k], p):
-                                rank = ranks[chunk, k]
-                                ranks[chunk, k] = rank + 1
-                                slot = _slot_of(rank, totals_in[k], points_out.shape[1])
-                                if slot >= 0:
-                                    b = keep_in[k]
-                                    at = _local(pose_in[k], p[0], p[1])
-                                    up = p[2] - boxes_in[b, 2]
-                                    half = 0.5 * boxes_in[b, 3]
-                                    wide = 0.5 * boxes_in[b, 4]
-                                    tall = 0.5 * boxes_in[b, 5]
-                                    points_out[k, slot, 0] = at[0]
-                                    points_out[k, slot, 1] = at[1]
-                                    points_out[k, slot, 2] = up
-                                    points_out[k, slot, 3] = half - at[0]
-                                    points_out[k, slot, 4] = half + at[0]
-                                    points_out[k, slot, 5] = wide - at[1]
-                                    points_out[k, slot, 6] = wide + at[1]
-                                    points_out[k, slot, 7] = tall - up
-                                    points_out[k, slot, 8] = tall + up
-                                    points_out[k, slot, 9] = p[2] + sensor_height_in[0]
-                                    points_out[k, slot, 10] = 1.0
-                            bits = bits >> wp.uint32(1)
-                            k += 1
+        for listed in range(chunk * run, listed_in[chunk]):
+            for word in range(bits_in.shape[1]):
+                bits = bits_in[listed, word]
+                while bits != wp.uint32(0):
+                    k = word * 32 + _lowest(bits)
+                    bits = bits & (bits - wp.uint32(1))
+                    rank = ranks[chunk, k]
+                    ranks[chunk, k] = rank + 1
+                    slot = _slot_of(rank, totals_in[k], points_out.shape[1])
+                    if slot >= 0:
+                        p = xyz_in[list_in[listed]]
+                        b = keep_in[k]
+                        at = _local(pose_in[k], p[0], p[1])
+                        up = p[2] - boxes_in[b, 2]
+                        half = 0.5 * boxes_in[b, 3]
+                        wide = 0.5 * boxes_in[b, 4]
+                        tall = 0.5 * boxes_in[b, 5]
+                        points_out[k, slot, 0] = at[0]
+                        points_out[k, slot, 1] = at[1]
+                        points_out[k, slot, 2] = up
+                        points_out[k, slot, 3] = half - at[0]
+                        points_out[k, slot, 4] = half + at[0]
+                        points_out[k, slot, 5] = wide - at[1]
+                        points_out[k, slot, 6] = wide + at[1]
+                        points_out[k, slot, 7] = tall - up
+                        points_out[k, slot, 8] = tall + up
+                        points_out[k, slot, 9] = p[2] + sensor_height_in[0]
+                        points_out[k, slot, 10] = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -360,7 +373,11 @@ class BoxPoints:
         buffer("_marks", (rows, columns, (self.boxes + 31) // 32), wp.uint32)
         buffer("_pose", self.boxes, wp.vec4)
         buffer("_reach", self.boxes, wp.vec4)
-        buffer("_ranks", (-(-self.capacity // self._run), self.boxes), wp.int32)
+        chunks = -(-self.capacity // self._run)
+        buffer("_ranks", (chunks, self.boxes), wp.int32)
+        buffer("_listed", chunks, wp.int32)
+        buffer("_list", chunks * self._run, wp.int32)
+        buffer("_bits", (chunks * self._run, (self.boxes + 31) // 32), wp.uint32)
         buffer("_height", 1, wp.float32)
         buffer("totals", self.boxes, wp.int32)
         keep("_parts", thread_count() if device == "cpu" else 1)
@@ -406,14 +423,16 @@ class BoxPoints:
             inputs=[boxes, keep, keep_count, *low, float(self.around), float(self.over_bottom), float(self.over_top)],
             outputs=[self._marks, self._pose, self._reach], device=device,
         )  # fmt: skip
-        found = [xyz, count, self._marks, self._pose, self._reach, *low, self._run]
-        self._launch_chunks(_count, ranks, found, [ranks])
+        lists = [self._listed, self._list, self._bits]
+        seen = [xyz, count, self._marks, self._pose, self._reach, *low, self._run]
+        self._launch_chunks(_find, ranks, seen, [ranks, *lists])
         wp.launch(
             _describe, self.boxes, inputs=[boxes, scores, kinds, keep, keep_count, height],
             outputs=[ranks, self.totals, self.described], device=device,
         )  # fmt: skip
         wp.launch(_clear, (self.boxes, self.points_of_box), inputs=[self.totals], outputs=[self.points], device=device)
-        self._launch_chunks(_take, ranks, [*found, boxes, keep, self.totals, height], [ranks, self.points])
+        seen = [xyz, self._pose, *lists, self._run, boxes, keep, self.totals, height]
+        self._launch_chunks(_take, ranks, seen, [ranks, self.points])
 
     def _launch_chunks(self, kernel: wp.Kernel, ranks: wp.array, inputs: list, outputs: list) -> None:
         """On a CPU the runs of points are shared out among its threads; a GPU has a thread for each."""

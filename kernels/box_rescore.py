@@ -32,6 +32,7 @@ def _rescore(
     keep_count_in: wp.array(dtype=wp.int32),
     said_in: wp.array2d(dtype=wp.float32),
     moved_in: wp.array(dtype=wp.int32),
+    size_shares_in: wp.array(dtype=wp.float32),
     first_weight: float,
     class_weight: float,
     overlap_weight: float,
@@ -85,8 +86,10 @@ def _rescore(
     boxes_out[k, 0] = boxes_in[b, 0] + along * c - across * s
     boxes_out[k, 1] = boxes_in[b, 1] + along * s + across * c
     boxes_out[k, 2] = boxes_in[b, 2] + wp.clamp(said_in[k, first + 2], -_MOST, _MOST) * boxes_in[b, 5]
+    share = size_shares_in[best - 1]
     for size in range(3):
-        boxes_out[k, 3 + size] = boxes_in[b, 3 + size] * wp.exp(wp.clamp(said_in[k, first + 3 + size], -_MOST, _MOST))
+        grown = share * wp.clamp(said_in[k, first + 3 + size], -_MOST, _MOST)
+        boxes_out[k, 3 + size] = boxes_in[b, 3 + size] * wp.exp(grown)
     yaw = boxes_in[b, 6] + wp.clamp(said_in[k, first + 6], -_MOST, _MOST)
     boxes_out[k, 6] = wp.where(yaw > wp.PI, yaw - wp.TAU, wp.where(yaw < -wp.PI, yaw + wp.TAU, yaw))
 
@@ -107,6 +110,8 @@ class BoxRescore:
     """Boxes that one launch looks at."""
     moved: Sequence[bool]
     """Whether boxes of each class take the residuals too, in the order of the network."""
+    size_shares: Sequence[float]
+    """How far the sizes of boxes of each class go from the old ones to those that the network says, 0 to 1."""
     weights: tuple[float, float, float]
     """Exponents of the old score, of the probability of the class, and of the overlap; they add up to 1."""
     device: str = "cpu"
@@ -119,6 +124,8 @@ class BoxRescore:
             raise ValueError("moved must say so of each class, not of none")
         if not all(weight >= 0.0 for weight in self.weights) or abs(sum(self.weights) - 1.0) > 1e-6:
             raise ValueError(f"weights must be at least 0 and add up to 1, not {self.weights}")
+        if len(self.size_shares) != len(self.moved) or not all(0.0 <= share <= 1.0 for share in self.size_shares):
+            raise ValueError(f"size_shares must be {len(self.moved)} of 0 to 1, not {self.size_shares}")
         device = resolve_device(self.device)
 
         def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
@@ -126,6 +133,8 @@ class BoxRescore:
 
         moved = wp.array(np.asarray(self.moved, np.int32), dtype=wp.int32, device=device)
         object.__setattr__(self, "_moved", moved)
+        shares = wp.array(np.asarray(self.size_shares, np.float32), dtype=wp.float32, device=device)
+        object.__setattr__(self, "_size_shares", shares)
         buffer("boxes_out", (self.boxes, 7), wp.float32)
         buffer("scores", self.boxes, wp.float32)
         buffer("kinds", self.boxes, wp.int32)
@@ -149,10 +158,11 @@ class BoxRescore:
         wanted = (self.boxes, 2 + len(self.moved) + len(RESIDUALS))
         if tuple(said.shape) != wanted:
             raise ValueError(f"said must have the shape {wanted}, not {tuple(said.shape)}")
+        how = [self._moved, self._size_shares, *map(float, self.weights), float(least)]
         wp.launch(
             _rescore,
             min(self.boxes, keep.shape[0]),
-            inputs=[boxes, scores, keep, keep_count, said, self._moved, *map(float, self.weights), float(least)],
+            inputs=[boxes, scores, keep, keep_count, said, *how],
             outputs=[self.boxes_out, self.scores, self.kinds, self.count, self.dropped],
             device=self.scores.device,
         )

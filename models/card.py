@@ -136,6 +136,8 @@ class SecondSpec(_Strict):
     """Up to how far above its top [m]."""
     moved: tuple[str, ...] = ()
     """Classes whose boxes are put where the second stage says; of others it says score and class alone."""
+    size_shares: dict[str, float] = Field(default_factory=dict)
+    """By class, how far sizes of moved boxes go from the first stage's to the second's, 0 to 1; else all the way."""
     weights: tuple[float, float, float] = (0.4, 0.4, 0.2)
     """Exponents in a score of the first stage's, of the class's probability, and of the thought overlap."""
 
@@ -143,6 +145,13 @@ class SecondSpec(_Strict):
     @classmethod
     def _beside_the_card(cls, value: str) -> str:
         return _name_of_file(value)
+
+    @field_validator("size_shares")
+    @classmethod
+    def _parts(cls, value: dict[str, float]) -> dict[str, float]:
+        if not all(0 <= share <= 1 for share in value.values()):
+            raise ValueError(f"must be from 0 to 1, not {value}")
+        return value
 
     @field_validator("weights")
     @classmethod
@@ -216,8 +225,9 @@ class HeadCard(LidarCard):
         if self.decode.overlap_weight and not self.output.overlap:
             return f"decode.overlap_weight is {self.decode.overlap_weight}, but output.regression has no {_OVERLAP}"
         if self.second is not None:
-            if unknown := [name for name in self.second.moved if name not in self.classes]:
-                return f"second.moved names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
+            for field, named in (("moved", self.second.moved), ("size_shares", self.second.size_shares)):
+                if unknown := [name for name in named if name not in self.classes]:
+                    return f"second.{field} names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
             if self.second.file == self.file:
                 return f"second.file is the first stage's, {self.file}"
         return ""

@@ -115,11 +115,12 @@ def train_second(samples: Samples, config: SecondConfig, network: SecondNet | No
     weights = torch.tensor(config.class_weights)
     order = np.empty(0, np.int64)
     sums: dict[str, float] = {}
+    warming = min(200, 1 + config.iterations // 10)
     for step in range(config.iterations):
         if len(order) < config.batch:
             order = np.concatenate([order, rng.permutation(len(samples))])
         which, order = order[: config.batch], order[config.batch :]
-        warm = min(1.0, (step + 1) / 200.0)
+        warm = min(1.0, (step + 1) / warming)
         rate = config.learning_rate * warm * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / config.iterations)))
         for group in optimiser.param_groups:
             group["lr"] = rate
@@ -163,7 +164,7 @@ def export_second(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network.eval(), (points, boxes), str(target), opset_version=_OPSET, dynamo=False,
+            network.folded(), (points, boxes), str(target), opset_version=_OPSET, dynamo=False,
             input_names=["points", "boxes"], output_names=["said"],
             dynamic_axes={name: {0: "candidates"} for name in ("points", "boxes", "said")},
         )  # fmt: skip

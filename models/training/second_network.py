@@ -6,6 +6,8 @@ mean of each channel over the points, whatever their order, and what is known of
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import nn
 
@@ -46,26 +48,38 @@ class SecondNet(nn.Module):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
             inputs = outputs
         self.boxes = nn.Sequential(*layers, nn.Linear(inputs, 2 + classes + len(RESIDUALS)))
-        self.register_buffer("point_scale", torch.tensor(_POINT_SCALE), persistent=False)
-        self.register_buffer("box_scale", torch.tensor(_BOX_SCALE + (1.0,) * classes), persistent=False)
+        self.point_scale = torch.tensor(_POINT_SCALE)
+        self.box_scale = torch.tensor(_BOX_SCALE + (1.0,) * classes)
+        self.is_folded = False
 
     def forward(self, points: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
-        """What is said of each box."""
-        there = points[:, :, -1:]
+        """What is said of each box. Rows of zeros, which are no points, all say one and the same."""
         if self.training:
-            highest, mean = self._of_points_there(points, there[:, :, 0] > 0)
+            highest, mean = self._of_points_there(points, points[:, :, -1] > 0)
         else:
             # Rows of two dimensions, so that ONNX Runtime has the rectifier in the product.
-            rows = (points * self.point_scale).reshape(-1, len(POINT_CHANNELS))
-            each = self.points(rows).reshape(-1, points.shape[1], self.width[-1]) * there
-            # No channel is below zero, so that a missing point's zeros are never the highest for want of another.
-            highest = each.amax(1)
-            mean = each.sum(1) / there.sum(1).clamp(min=1.0)
-        return self.boxes(torch.cat([highest, mean, boxes * self.box_scale], 1))
+            each = self.points(self._scaled(points, self.point_scale).reshape(-1, len(POINT_CHANNELS)))
+            each = each.reshape(-1, points.shape[1], self.width[-1])
+            highest, mean = each.amax(1), each.mean(1)
+        return self.boxes(torch.cat([highest, mean, self._scaled(boxes, self.box_scale)], 1))
+
+    def _scaled(self, values: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+        return values if self.is_folded else values * scale
 
     def _of_points_there(self, points: torch.Tensor, there: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The same from the points that there are: two thirds of the rows are none, and a step takes half as long."""
-        each, lengths = self.points(points[there] * self.point_scale), there.sum(1)
+        most, lengths = points.shape[1], there.sum(1)
+        each, none = self.points(points[there] * self.point_scale), self.points(points.new_zeros(1, points.shape[2]))
         highest = torch.segment_reduce(each, "max", lengths=lengths, initial=0.0)
+        highest = torch.where((lengths < most)[:, None], torch.maximum(highest, none), highest)
         total = torch.segment_reduce(each, "sum", lengths=lengths, initial=0.0)
-        return highest, total / lengths.clamp(min=1)[:, None]
+        return highest, (total + (most - lengths)[:, None] * none) / most
+
+    def folded(self) -> SecondNet:
+        """The same in evaluation, with the scales of what it takes in the weights of its first layers."""
+        network = copy.deepcopy(self).eval()
+        with torch.no_grad():
+            network.points[0].weight.mul_(self.point_scale)
+            network.boxes[0].weight[:, 2 * self.width[-1] :].mul_(self.box_scale)
+        network.is_folded = True
+        return network

@@ -275,7 +275,7 @@ def draw(
     level = centre[:, 2] + heights + ground
     faces = torch.stack([half - points, half + points], -1).flatten(-2)
     gathered = torch.cat([points, faces, points[..., 2:] + level[:, None, None], torch.ones_like(valid)], -1) * valid
-    away = torch.hypot(boxes[:, 0], boxes[:, 1]).clamp(min=0.1)
+    away = torch.hypot(centre[:, 0], centre[:, 1]).clamp(min=0.1)
     c, s = torch.cos(yaw), torch.sin(yaw)
     across = (centre[:, 0] * s - centre[:, 1] * c) / away
     described = torch.stack(

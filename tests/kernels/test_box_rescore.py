@@ -7,10 +7,11 @@ import warp as wp
 from warploom.kernels.box_rescore import BoxRescore
 
 KINDS, MOST = 3, 16
+SHARES = (0.5, 1.0, 1.0)
 
 
 def rescore(boxes, scores, keep, said, *, moved=(True, False, True), weights=(0.3, 0.5, 0.2), least=0.2, count=None):
-    plan = BoxRescore(boxes=MOST, moved=moved, weights=weights)
+    plan = BoxRescore(boxes=MOST, moved=moved, size_shares=SHARES, weights=weights)
 
     def array(values, dtype):
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
@@ -50,7 +51,7 @@ def reference(boxes, scores, keep, said, moved, weights, least):
     out[:, 0] += a * c - b * s
     out[:, 1] += a * s + b * c
     out[:, 2] += move[:, 2] * out[:, 5]
-    out[:, 3:6] *= np.exp(move[:, 3:6])
+    out[:, 3:6] *= np.exp(move[:, 3:6] * np.array(SHARES)[kinds][:, None])
     out[:, 6] = (out[:, 6] + move[:, 6] + np.pi) % (2 * np.pi) - np.pi
     return out, np.where(new >= least, new, np.nan), kinds
 
@@ -86,7 +87,7 @@ def test_what_nobody_looks_at_is_counted_where_its_score_would_do():
 def test_large_residuals_are_bounded():
     boxes = np.array([[10, 0, -1, 3, 4, 1.5, 0]])
     said = np.zeros((MOST, 12))
-    said[:, 1], said[:, 5:] = 5, 9
+    said[:, 3], said[:, 5:] = 5, 9
     moved = rescore(boxes, [0.9], [0], said)[0][0]
     np.testing.assert_allclose(moved, [15, 5, 0.5, 3 * np.e, 4 * np.e, 1.5 * np.e, 1], rtol=1e-5)
 
@@ -97,11 +98,18 @@ def test_a_network_that_says_nan_finds_nothing():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"), [({"boxes": 0}, "boxes"), ({"moved": ()}, "moved"), ({"weights": (0.5, 0.6, -0.1)}, "weights")]
+    ("wrong", "said"),
+    [
+        ({"boxes": 0}, "boxes"),
+        ({"moved": ()}, "moved"),
+        ({"weights": (0.5, 0.6, -0.1)}, "weights"),
+        ({"size_shares": (2.0,)}, "size_shares"),
+        ({"size_shares": (1.0, 1.0)}, "size_shares"),
+    ],
 )
 def test_wrong_arguments_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
-        BoxRescore(**{"boxes": 4, "moved": (True,), "weights": (0.5, 0.5, 0.0), **wrong})
+        BoxRescore(**{"boxes": 4, "moved": (True,), "size_shares": (1.0,), "weights": (0.5, 0.5, 0.0), **wrong})
 
 
 def test_a_network_of_other_outputs_is_refused():

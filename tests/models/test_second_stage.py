@@ -162,6 +162,8 @@ def test_candidates_that_nobody_looks_at_are_counted(both, clouds, tmp_path):
         ({"file": "../pillar_center_second.onnx"}, "second.file: .*must be the name of a file beside the card"),
         ({"file": "pillar_center_int8.onnx"}, "second.file is the first stage's"),
         ({"moved": ["unicorn"]}, "second.moved names unicorn, but the classes are vehicle"),
+        ({"size_shares": {"unicorn": 0.5}}, "second.size_shares names unicorn"),
+        ({"size_shares": {"vehicle": 1.5}}, "second.size_shares: .*from 0 to 1"),
         ({"weights": [0.5, 0.6, 0.1]}, "second.weights: .*add up to 1"),
         ({"candidate_score": 1.5}, "second.candidate_score"),
         ({"points_of_box": 64}, r"its input is .*points.*, but the card says .*64, 11"),
