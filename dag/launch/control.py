@@ -167,6 +167,8 @@ class ControlClient:
                     kind = ConfigError if answer.get("asked_wrong") else WarploomError
                     raise kind(str(answer.get("error")))
                 return answer.get("result")
+        except (BrokenPipeError, ConnectionResetError):
+            pass
         except (OSError, ValueError) as error:
             raise WarploomError(f"the supervisor does not answer: {error}") from error
         raise WarploomError("the supervisor has ended")

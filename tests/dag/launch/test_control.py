@@ -147,3 +147,17 @@ def test_who_may_not_look_into_the_folder_of_the_nodes_is_told_so(run_base, monk
     monkeypatch.setattr(os, "access", lambda path, mode: path != run_base)
     with pytest.raises(ConfigError, match="is not readable for this user: ask as the user who runs the node"):
         connect()
+
+
+def test_a_supervisor_that_went_away_between_two_questions_has_ended(serve):
+    clients = []
+
+    def scenario(path, server):
+        clients.append(ControlClient(path))
+        assert clients[0].ask("echo")["request"] == "echo"
+
+    serve(scenario)
+    with clients[0] as client:
+        for _ in range(2):  # the first finds the end of the answers or a reset, the second nobody to write to
+            with pytest.raises(WarploomError, match="the supervisor has ended"):
+                client.ask("echo")
