@@ -33,6 +33,7 @@ def _rescore(
     said_in: wp.array2d(dtype=wp.float32),
     moved_in: wp.array(dtype=wp.int32),
     size_shares_in: wp.array(dtype=wp.float32),
+    powers_in: wp.array(dtype=wp.float32),
     first_weight: float,
     class_weight: float,
     overlap_weight: float,
@@ -70,6 +71,7 @@ def _rescore(
     probability = wp.exp(said_in[k, best] - highest) / whole
     overlap = 1.0 / (1.0 + wp.exp(-said_in[k, kinds + 1]))
     score = wp.pow(scores_in[b], first_weight) * wp.pow(probability, class_weight) * wp.pow(overlap, overlap_weight)
+    score = wp.pow(score, powers_in[best - 1])
     # NaN, which suppression leaves out.
     scores_out[k] = wp.where(score >= least, score, wp.nan)
     kinds_out[k] = best - 1
@@ -112,6 +114,8 @@ class BoxRescore:
     """Whether boxes of each class take the residuals too, in the order of the network."""
     size_shares: Sequence[float]
     """How far the sizes of boxes of each class go from the old ones to those that the network says, 0 to 1."""
+    powers: Sequence[float]
+    """Of scores of each class, above 0: so that one threshold fits all classes."""
     weights: tuple[float, float, float]
     """Exponents of the old score, of the probability of the class, and of the overlap; they add up to 1."""
     device: str = "cpu"
@@ -126,6 +130,8 @@ class BoxRescore:
             raise ValueError(f"weights must be at least 0 and add up to 1, not {self.weights}")
         if len(self.size_shares) != len(self.moved) or not all(0.0 <= share <= 1.0 for share in self.size_shares):
             raise ValueError(f"size_shares must be {len(self.moved)} of 0 to 1, not {self.size_shares}")
+        if len(self.powers) != len(self.moved) or not all(power > 0.0 for power in self.powers):
+            raise ValueError(f"powers must be {len(self.moved)} above 0, not {self.powers}")
         device = resolve_device(self.device)
 
         def buffer(name: str, shape: int | tuple[int, int], dtype: type) -> None:
@@ -135,6 +141,8 @@ class BoxRescore:
         object.__setattr__(self, "_moved", moved)
         shares = wp.array(np.asarray(self.size_shares, np.float32), dtype=wp.float32, device=device)
         object.__setattr__(self, "_size_shares", shares)
+        powers = wp.array(np.asarray(self.powers, np.float32), dtype=wp.float32, device=device)
+        object.__setattr__(self, "_powers", powers)
         buffer("boxes_out", (self.boxes, 7), wp.float32)
         buffer("scores", self.boxes, wp.float32)
         buffer("kinds", self.boxes, wp.int32)
@@ -158,7 +166,7 @@ class BoxRescore:
         wanted = (self.boxes, 2 + len(self.moved) + len(RESIDUALS))
         if tuple(said.shape) != wanted:
             raise ValueError(f"said must have the shape {wanted}, not {tuple(said.shape)}")
-        how = [self._moved, self._size_shares, *map(float, self.weights), float(least)]
+        how = [self._moved, self._size_shares, self._powers, *map(float, self.weights), float(least)]
         wp.launch(
             _rescore,
             min(self.boxes, keep.shape[0]),

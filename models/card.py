@@ -138,6 +138,8 @@ class SecondSpec(_Strict):
     """Classes whose boxes are put where the second stage says; of others it says score and class alone."""
     size_shares: dict[str, float] = Field(default_factory=dict)
     """By class, how far sizes of moved boxes go from the first stage's to the second's, 0 to 1; else all the way."""
+    powers: dict[str, float] = Field(default_factory=dict)
+    """By class, to which power its scores are raised, so that one threshold fits all classes; else 1."""
     weights: tuple[float, float, float] = (0.4, 0.4, 0.2)
     """Exponents in a score of the first stage's, of the class's probability, and of the thought overlap."""
 
@@ -151,6 +153,13 @@ class SecondSpec(_Strict):
     def _parts(cls, value: dict[str, float]) -> dict[str, float]:
         if not all(0 <= share <= 1 for share in value.values()):
             raise ValueError(f"must be from 0 to 1, not {value}")
+        return value
+
+    @field_validator("powers")
+    @classmethod
+    def _positive(cls, value: dict[str, float]) -> dict[str, float]:
+        if not all(power > 0 for power in value.values()):
+            raise ValueError(f"must be above 0, not {value}")
         return value
 
     @field_validator("weights")
@@ -225,7 +234,8 @@ class HeadCard(LidarCard):
         if self.decode.overlap_weight and not self.output.overlap:
             return f"decode.overlap_weight is {self.decode.overlap_weight}, but output.regression has no {_OVERLAP}"
         if self.second is not None:
-            for field, named in (("moved", self.second.moved), ("size_shares", self.second.size_shares)):
+            spec = self.second
+            for field, named in (("moved", spec.moved), ("size_shares", spec.size_shares), ("powers", spec.powers)):
                 if unknown := [name for name in named if name not in self.classes]:
                     return f"second.{field} names {', '.join(unknown)}, but the classes are {', '.join(self.classes)}"
             if self.second.file == self.file:

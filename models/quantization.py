@@ -7,6 +7,7 @@ the onnx package (`pip install 'warploom[torch]'`).
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -58,7 +59,7 @@ def quantize_head(
     keep: tuple[str, ...] = ("head",),
     measured: dict[str, Any] | None = None,
 ) -> Path:
-    """Writes `NAME_int8.onnx` and `NAME_int8.yaml` beside each other.
+    """Writes `NAME_int8.onnx` and `NAME_int8.yaml` beside each other; a second stage goes with them as it is.
 
     Args:
         card: Of a pillar centre head.
@@ -121,6 +122,8 @@ def quantize_head(
             "measured": measured or {},
         }
     )
+    if old.second is not None and folder.resolve() != model.parent.resolve():
+        shutil.copyfile(model.parent / old.second.file, folder / old.second.file)
     path = folder / f"{old.name}_int8.yaml"
     save_card(path, new)
     return path

@@ -48,6 +48,7 @@ class _Look:
             boxes=spec.max_boxes,
             moved=tuple(name in spec.moved for name in card.classes),
             size_shares=tuple(spec.size_shares.get(name, 1.0) for name in card.classes),
+            powers=tuple(spec.powers.get(name, 1.0) for name in card.classes),
             weights=spec.weights,
             device=device,
         )

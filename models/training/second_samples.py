@@ -150,11 +150,13 @@ class SecondAugmentation:
     """Of the points [m]."""
     thin: float = 0.4
     """Share of the candidates that lose a part of their points, up to 75 %."""
+    cut: float = 0.3
+    """Share of the candidates that lose the points on one side of a plane through them: no part is always seen."""
     alone: float = 0.1
     """Share of the candidates that lose the points around the box."""
     bend: float = 0.4
     """Standard deviation of the logit of the score."""
-    mistaken: float = 0.25
+    mistaken: float = 0.15
     """Share of the people and riders that come in the other's box: real ones are taken for each other far more often
     than simulated ones, so that a second stage learns to believe the first one's class and size."""
     broad: float = 0.3
@@ -265,6 +267,9 @@ def draw(
     inside = there & (points[..., :2].abs() <= half[..., :2] + around).all(-1)
     inside &= (points[..., 2] >= over_bottom - half[..., 2]) & (points[..., 2] <= half[..., 2] + over_top)
     if options is not None:
+        towards = normal(n, 1, 3) / half
+        lost = (points * towards).sum(-1) > (0.2 + 0.8 * uniform(n, 1)) * (towards * half).norm(dim=-1)
+        inside &= ~lost | (uniform(n) >= options.cut)[:, None]
         near = (points.abs() <= half + 0.1).all(-1)
         inside &= near | (uniform(n) >= options.alone)[:, None]
     total = inside.sum(1) * found.clamp(min=1) / stored.clamp(min=1)

@@ -8,10 +8,11 @@ from warploom.kernels.box_rescore import BoxRescore
 
 KINDS, MOST = 3, 16
 SHARES = (0.5, 1.0, 1.0)
+POWERS = (1.0, 0.7, 1.2)
 
 
 def rescore(boxes, scores, keep, said, *, moved=(True, False, True), weights=(0.3, 0.5, 0.2), least=0.2, count=None):
-    plan = BoxRescore(boxes=MOST, moved=moved, size_shares=SHARES, weights=weights)
+    plan = BoxRescore(boxes=MOST, moved=moved, size_shares=SHARES, powers=POWERS, weights=weights)
 
     def array(values, dtype):
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
@@ -44,6 +45,7 @@ def reference(boxes, scores, keep, said, moved, weights, least):
     kinds = p.argmax(1)
     overlap = 1 / (1 + np.exp(-said[:, KINDS + 1]))
     new = scores[keep] ** weights[0] * p.max(1) ** weights[1] * overlap ** weights[2]
+    new = new ** np.array(POWERS)[kinds]
     move = np.clip(said[:, KINDS + 2 :], -1, 1) * np.array(moved)[kinds][:, None]
     c, s = np.cos(out[:, 6]), np.sin(out[:, 6])
     diagonal = np.hypot(out[:, 3], out[:, 4])
@@ -104,12 +106,22 @@ def test_a_network_that_says_nan_finds_nothing():
         ({"moved": ()}, "moved"),
         ({"weights": (0.5, 0.6, -0.1)}, "weights"),
         ({"size_shares": (2.0,)}, "size_shares"),
+        ({"powers": (0.0,)}, "powers"),
         ({"size_shares": (1.0, 1.0)}, "size_shares"),
     ],
 )
 def test_wrong_arguments_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
-        BoxRescore(**{"boxes": 4, "moved": (True,), "size_shares": (1.0,), "weights": (0.5, 0.5, 0.0), **wrong})
+        BoxRescore(
+            **{
+                "boxes": 4,
+                "moved": (True,),
+                "size_shares": (1.0,),
+                "powers": (1.0,),
+                "weights": (0.5, 0.5, 0.0),
+                **wrong,
+            }
+        )
 
 
 def test_a_network_of_other_outputs_is_refused():

@@ -47,3 +47,14 @@ def test_it_says_nearly_the_same(cards, clouds):
         maps.append(head._maps.numpy().copy())
     assert np.abs(maps[1] - maps[0]).mean() < 0.05 * maps[0].std()
     assert not np.array_equal(maps[0], maps[1])
+
+
+def test_a_second_stage_goes_with_it(cards, clouds, tmp_path):
+    from warploom.models.training.second import export_second
+    from warploom.models.training.second_network import SecondNet
+
+    both = export_second(SecondNet(5), cards[0], tmp_path / "both", training={})
+    new, model = load_card(quantize_head(both, tmp_path / "small", [(clouds[0], 1.7)]))
+    assert new.second == load_card(both)[0].second
+    assert (model.parent / new.second.file).read_bytes() == (both.parent / new.second.file).read_bytes()
+    assert not (cards[0].parent / new.second.file).exists()

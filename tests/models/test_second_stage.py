@@ -164,6 +164,8 @@ def test_candidates_that_nobody_looks_at_are_counted(both, clouds, tmp_path):
         ({"moved": ["unicorn"]}, "second.moved names unicorn, but the classes are vehicle"),
         ({"size_shares": {"unicorn": 0.5}}, "second.size_shares names unicorn"),
         ({"size_shares": {"vehicle": 1.5}}, "second.size_shares: .*from 0 to 1"),
+        ({"powers": {"unicorn": 0.5}}, "second.powers names unicorn"),
+        ({"powers": {"vehicle": 0.0}}, "second.powers: .*above 0"),
         ({"weights": [0.5, 0.6, 0.1]}, "second.weights: .*add up to 1"),
         ({"candidate_score": 1.5}, "second.candidate_score"),
         ({"points_of_box": 64}, r"its input is .*points.*, but the card says .*64, 11"),
