@@ -107,8 +107,8 @@ def test_variation_keeps_points_in_their_boxes_and_truth_with_them():
     """Faces add up to the sizes, whatever is turned, moved, mirrored or stretched; 1e-5 m in float32."""
     rng = np.random.default_rng(3)
     frame, found = scene(rng)
-    samples = join([samples_of(found, frame, rng)] * 30)
-    drawn = draw(samples, np.arange(120), torch.Generator().manual_seed(1), SecondAugmentation())
+    samples = join([samples_of(found, frame, rng)] * 100)
+    drawn = draw(samples, np.arange(400), torch.Generator().manual_seed(1), SecondAugmentation())
     there = drawn.points[..., 10] > 0
     for axis in range(3):
         both = drawn.points[..., 3 + 2 * axis] + drawn.points[..., 4 + 2 * axis]
@@ -117,9 +117,9 @@ def test_variation_keeps_points_in_their_boxes_and_truth_with_them():
     assert (drawn.points[~there] == 0).all()
     torch.testing.assert_close(drawn.described[:, :3], drawn.sizes.log(), atol=1e-5, rtol=0)
     torch.testing.assert_close(
-        drawn.described[:, 6] ** 2 + drawn.described[:, 7] ** 2, torch.ones(120), atol=1e-4, rtol=0
+        drawn.described[:, 6] ** 2 + drawn.described[:, 7] ** 2, torch.ones(400), atol=1e-4, rtol=0
     )
-    assert 0.15 < (drawn.described[1::4, 11] == 1).float().mean() < 0.6  # people in riders' boxes
+    assert 0.05 < (drawn.described[1::4, 11] == 1).float().mean() < 0.3  # people in riders' boxes
 
 
 def test_overlap_is_that_of_boxes_that_head_alike():
