@@ -35,6 +35,7 @@ BOX_CHANNELS = (
 bottom above the ground [m], the direction to the sensor in its frame, and its score; a one for its class follows."""
 
 _CELL = wp.constant(0.5)  # [m] edge of a cell of the map that tells whose a point may be
+_CELLS_OF_METRE = wp.constant(2.0)
 _CPU_RUN = 4096
 _GPU_RUN = 256
 _MIX = wp.constant(wp.uint32(0x9E3779B1))
@@ -73,6 +74,7 @@ def _mark(
     over_top: float,
     # in out
     marks: wp.array3d(dtype=wp.uint32),
+    covered: wp.array2d(dtype=wp.int32),
     # out
     pose_out: wp.array(dtype=wp.vec4),
     reach_out: wp.array(dtype=wp.vec4),
@@ -105,16 +107,7 @@ def _mark(
             at = _local(pose, low_x + (float(column) + 0.5) * _CELL, low_y + (float(row) + 0.5) * _CELL)
             if wp.abs(at[0]) <= half and wp.abs(at[1]) <= wide:
                 wp.atomic_or(marks, row, column, k >> 5, bit)
-
-
-@wp.func
-def _cell_of(p: wp.vec3, low_x: float, low_y: float, rows: int, columns: int) -> wp.vec2i:
-    """Row and column of a point's cell, −1 where it has none."""
-    u = (p[0] - low_x) / _CELL
-    v = (p[1] - low_y) / _CELL
-    if u >= 0.0 and v >= 0.0 and u < float(columns) and v < float(rows):
-        return wp.vec2i(int(v), int(u))
-    return wp.vec2i(-1, -1)
+                covered[row, column] = 1
 
 
 @wp.func_native("""
@@ -137,6 +130,7 @@ def _find(
     xyz_in: wp.array(dtype=wp.vec3),
     count_in: wp.array(dtype=wp.int32),
     marks_in: wp.array3d(dtype=wp.uint32),
+    covered_in: wp.array2d(dtype=wp.int32),
     pose_in: wp.array(dtype=wp.vec4),
     reach_in: wp.array(dtype=wp.vec4),
     low_x: float,
@@ -149,30 +143,35 @@ def _find(
     bits_out: wp.array2d(dtype=wp.uint32),
 ):
     """Lists the points of each run that are in boxes, each with the bits of its boxes, and counts those of each box."""
+    rows = float(covered_in.shape[0])
+    columns = float(covered_in.shape[1])
     for chunk in range(part + parts * wp.tid(), ranks_out.shape[0], parts * lanes):
         for k in range(ranks_out.shape[1]):
             ranks_out[chunk, k] = 0
         slot = int(chunk * run)
         for i in range(chunk * run, wp.min((chunk + 1) * run, count_in[0])):
             p = xyz_in[i]
-            cell = _cell_of(p, low_x, low_y, marks_in.shape[0], marks_in.shape[1])
-            if cell[0] >= 0:
-                any_box = bool(False)
-                for word in range(marks_in.shape[2]):
-                    bits = marks_in[cell[0], cell[1], word]
-                    inside = wp.uint32(0)
-                    while bits != wp.uint32(0):
-                        bit = _lowest(bits)
-                        bits = bits & (bits - wp.uint32(1))
-                        k = word * 32 + bit
-                        if _holds(pose_in[k], reach_in[k], p):
-                            inside = inside | (wp.uint32(1) << wp.uint32(bit))
-                            ranks_out[chunk, k] = ranks_out[chunk, k] + 1
-                    bits_out[slot, word] = inside
-                    any_box = any_box or inside != wp.uint32(0)
-                if any_box:
-                    list_out[slot] = i
-                    slot += 1
+            u = (p[0] - low_x) * _CELLS_OF_METRE
+            v = (p[1] - low_y) * _CELLS_OF_METRE
+            # Nested, as a kernel evaluates both sides of an `and`.
+            if u >= 0.0 and v >= 0.0 and u < columns and v < rows:  # noqa: SIM102
+                if covered_in[int(v), int(u)] != 0:
+                    any_box = bool(False)
+                    for word in range(marks_in.shape[2]):
+                        bits = marks_in[int(v), int(u), word]
+                        inside = wp.uint32(0)
+                        while bits != wp.uint32(0):
+                            bit = _lowest(bits)
+                            bits = bits & (bits - wp.uint32(1))
+                            k = word * 32 + bit
+                            if _holds(pose_in[k], reach_in[k], p):
+                                inside = inside | (wp.uint32(1) << wp.uint32(bit))
+                                ranks_out[chunk, k] = ranks_out[chunk, k] + 1
+                        bits_out[slot, word] = inside
+                        any_box = any_box or inside != wp.uint32(0)
+                    if any_box:
+                        list_out[slot] = i
+                        slot += 1
         listed_out[chunk] = slot
 
 
@@ -371,6 +370,7 @@ class BoxPoints:
         columns, rows = (int(np.ceil(extent / float(_CELL))) for extent in self.size)
         keep("_run", _CPU_RUN if device == "cpu" else _GPU_RUN)
         buffer("_marks", (rows, columns, (self.boxes + 31) // 32), wp.uint32)
+        buffer("_covered", (rows, columns), wp.int32)
         buffer("_pose", self.boxes, wp.vec4)
         buffer("_reach", self.boxes, wp.vec4)
         chunks = -(-self.capacity // self._run)
@@ -418,13 +418,14 @@ class BoxPoints:
         chunks = -(-n // self._run)
         ranks = self._ranks[: max(chunks, 1)]
         self._marks.zero_()
+        self._covered.zero_()
         wp.launch(
             _mark, most,
             inputs=[boxes, keep, keep_count, *low, float(self.around), float(self.over_bottom), float(self.over_top)],
-            outputs=[self._marks, self._pose, self._reach], device=device,
+            outputs=[self._marks, self._covered, self._pose, self._reach], device=device,
         )  # fmt: skip
         lists = [self._listed, self._list, self._bits]
-        seen = [xyz, count, self._marks, self._pose, self._reach, *low, self._run]
+        seen = [xyz, count, self._marks, self._covered, self._pose, self._reach, *low, self._run]
         self._launch_chunks(_find, ranks, seen, [ranks, *lists])
         wp.launch(
             _describe, self.boxes, inputs=[boxes, scores, kinds, keep, keep_count, height],

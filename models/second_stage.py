@@ -7,6 +7,7 @@ candidates' points are gathered by our kernel where ONNX Runtime reads them, and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import warp as wp
@@ -16,12 +17,13 @@ from ..kernels.box_points import BOX_CHANNELS, POINT_CHANNELS, BoxPoints
 from ..kernels.box_rescore import RESIDUALS, BoxRescore
 from ..kernels.decode import CenterDecode
 from ..kernels.nms import RotatedNms
+from ..kernels.threads import run_together
 from .card import HeadCard, SecondSpec
 from .network import Network
 
 __all__ = ["SecondStage"]
 
-_AT_ONCE = 16  # candidates in a run on a CPU: what is between the layers stays in its cache
+_AT_ONCE = 8  # candidates in a run on a CPU: what is between the layers stays in its cache
 
 
 class _Look:
@@ -67,7 +69,7 @@ class SecondStage:
         card: With `second`.
         folder: Where the card is.
         device: Where the kernels run.
-        threads: CPU threads of the network.
+        threads: CPU threads that the network's candidates are shared out among.
         precision: As of `network.Network`.
         providers: As of `network.Network`.
         capacity: Most points of a cloud.
@@ -97,17 +99,23 @@ class SecondStage:
             "boxes": (len(BOX_CHANNELS) + len(card.classes),),
         }
         outputs = {"said": (2 + len(card.classes) + len(RESIDUALS),)}
-        self._network = Network(
-            model,
-            {name: (None, *shape) for name, shape in inputs.items()},
-            {name: (None, *shape) for name, shape in outputs.items()},
-            device=device,
-            threads=threads,
-            precision=precision,
-            providers=providers,
-            classes=card.classes,
-        )
-        self.provider, self.fallback = self._network.provider, self._network.fallback
+        # On a CPU it is known how many candidates there are, and the network looks at no more: some of them on each
+        # thread, for within so small a network there is nothing to share.
+        self._counted = device == "cpu"
+        self._networks = [
+            Network(
+                model,
+                {name: (None, *shape) for name, shape in inputs.items()},
+                {name: (None, *shape) for name, shape in outputs.items()},
+                device=device,
+                threads=1,
+                precision=precision,
+                providers=providers,
+                classes=card.classes,
+            )
+            for _ in range(min(threads, -(-rows // _AT_ONCE)) if self._counted else 1)
+        ]
+        self.provider, self.fallback = self._networks[0].provider, self._networks[0].fallback
         self._whole = {
             name: wp.zeros((batch * rows, *shape), dtype=wp.float32, device=device)
             for name, shape in (inputs | outputs).items()
@@ -116,22 +124,33 @@ class SecondStage:
             _Look(card, spec, capacity, [a[k * rows : (k + 1) * rows] for a in self._whole.values()], device)
             for k in range(batch)
         ]
-        # On a CPU it is known how many candidates there are, and the network looks at no more.
-        self._counted = device == "cpu"
-        self._bind(list(self._whole.values()))
-        try:
-            self._network.run()
-        except Exception as error:  # ONNX Runtime has a family of exceptions of its own, not all of them public
-            raise ModelError(f"{model}: it does not take {batch * rows} candidates at once: {error}") from error
+        for network in self._networks:
+            self._bind(network, list(self._whole.values()))
+            try:
+                network.run()
+            except Exception as error:  # ONNX Runtime has a family of exceptions of its own, not all of them public
+                raise ModelError(f"{model}: it does not take {batch * rows} candidates at once: {error}") from error
 
     def look(self, row: int) -> _Look:
         """The kernels of a cloud of the batch: its boxes are in `rescore`, of which those that stay are in `nms`."""
         return self._looks[row]
 
-    def _bind(self, arrays: Sequence[wp.array]) -> None:
-        self._network.bind_input("points", arrays[0])
-        self._network.bind_input("boxes", arrays[1])
-        self._network.bind_output("said", arrays[2])
+    @staticmethod
+    def _bind(network: Network, arrays: Sequence[wp.array]) -> None:
+        network.bind_input("points", arrays[0])
+        network.bind_input("boxes", arrays[1])
+        network.bind_output("said", arrays[2])
+
+    def _look_at(self, look: _Look, count: int) -> None:
+        """Lets the networks look at the first so many candidates of a cloud, each at every so manieth lot of them."""
+        lanes = len(self._networks)
+
+        def run(lane: int) -> None:
+            for first in range(lane * _AT_ONCE, count, lanes * _AT_ONCE):
+                self._bind(self._networks[lane], [rows[first : min(first + _AT_ONCE, count)] for rows in look.arrays])
+                self._networks[lane].run()
+
+        run_together([partial(run, lane) for lane in range(min(lanes, -(-count // _AT_ONCE)))])
 
     def launch(
         self,
@@ -158,12 +177,9 @@ class SecondStage:
                 cloud[2],
             )
             if self._counted:
-                count = min(int(nms.keep_count.numpy()[0]), self._spec.max_boxes)
-                for first in range(0, count, _AT_ONCE):
-                    self._bind([array[first : min(first + _AT_ONCE, count)] for array in look.arrays])
-                    self._network.run()
+                self._look_at(look, min(int(nms.keep_count.numpy()[0]), self._spec.max_boxes))
         if not self._counted:
-            self._network.run()
+            self._networks[0].run()
         for look, (decode, nms) in zip(self._looks, found, strict=False):
             look.rescore.launch(decode.boxes, decode.scores, nms.keep, nms.keep_count, look.arrays[2], score_threshold)
             look.nms.launch(look.rescore.boxes_out, look.rescore.scores, look.rescore.count)
