@@ -24,6 +24,30 @@ _MOST = wp.constant(1.0)  # of a residual; what is larger is no small correction
 
 
 @wp.kernel
+def _choose(
+    # in
+    scores_in: wp.array(dtype=wp.float32),
+    kinds_in: wp.array(dtype=wp.int32),
+    keep_in: wp.array(dtype=wp.int32),
+    keep_count_in: wp.array(dtype=wp.int32),
+    powers_in: wp.array(dtype=wp.float32),
+    first_weight: float,
+    least: float,
+    # out
+    chosen_out: wp.array(dtype=wp.int32),
+    chosen_count_out: wp.array(dtype=wp.int32),
+):
+    """One thread: in their order, the boxes whose score can still become high enough."""
+    chosen = int(0)
+    for k in range(wp.min(keep_count_in[0], keep_in.shape[0])):
+        b = keep_in[k]
+        if wp.pow(scores_in[b], first_weight * powers_in[kinds_in[b]]) >= least:
+            chosen_out[chosen] = b
+            chosen += 1
+    chosen_count_out[0] = chosen
+
+
+@wp.kernel
 def _rescore(
     # in
     boxes_in: wp.array2d(dtype=wp.float32),
@@ -101,6 +125,8 @@ class BoxRescore:
     """A plan: new boxes of up to `boxes` old ones.
 
     Attributes:
+        chosen: What `choose` left, shape (candidates,), int32.
+        chosen_count: How many they are, shape (1,), int32.
         boxes_out: Shape (boxes, 7), float32.
         scores: Shape (boxes,), float32; NaN where a score is too low.
         kinds: Shape (boxes,), int32.
@@ -110,6 +136,8 @@ class BoxRescore:
 
     boxes: int
     """Boxes that one launch looks at."""
+    candidates: int
+    """Boxes that those are chosen from, at most."""
     moved: Sequence[bool]
     """Whether boxes of each class take the residuals too, in the order of the network."""
     size_shares: Sequence[float]
@@ -122,8 +150,8 @@ class BoxRescore:
     """A Warp device, such as `cpu` or `cuda:0`."""
 
     def __post_init__(self):
-        if self.boxes < 1:
-            raise ValueError(f"boxes must be at least 1, not {self.boxes}")
+        if self.boxes < 1 or self.candidates < 1:
+            raise ValueError(f"boxes and candidates must be at least 1, not {self.boxes} and {self.candidates}")
         if not len(self.moved):
             raise ValueError("moved must say so of each class, not of none")
         if not all(weight >= 0.0 for weight in self.weights) or abs(sum(self.weights) - 1.0) > 1e-6:
@@ -143,11 +171,29 @@ class BoxRescore:
         object.__setattr__(self, "_size_shares", shares)
         powers = wp.array(np.asarray(self.powers, np.float32), dtype=wp.float32, device=device)
         object.__setattr__(self, "_powers", powers)
+        buffer("chosen", self.candidates, wp.int32)
+        buffer("chosen_count", 1, wp.int32)
         buffer("boxes_out", (self.boxes, 7), wp.float32)
         buffer("scores", self.boxes, wp.float32)
         buffer("kinds", self.boxes, wp.int32)
         buffer("count", 1, wp.int32)
         buffer("dropped", 1, wp.int32)
+
+    def choose(self, scores: wp.array, kinds: wp.array, keep: wp.array, keep_count: wp.array, least: float) -> None:
+        """Fills `chosen` and `chosen_count`: boxes that, certain to be of their class, would reach the least score.
+
+        Args:
+            scores: Shape (b,), float32, in [0, 1].
+            kinds: Their classes, shape (b,), int32.
+            keep: Which of them, shape (k,), int32, k ≤ `candidates`.
+            keep_count: How many of these, shape (1,), int32.
+            least: Least new score.
+        """
+        if keep.shape[0] > self.candidates:
+            raise ValueError(f"{keep.shape[0]} boxes are more than the plan's {self.candidates} candidates")
+        inputs = [scores, kinds, keep, keep_count, self._powers, float(self.weights[0]), float(least)]
+        outputs = [self.chosen, self.chosen_count]
+        wp.launch(_choose, 1, inputs=inputs, outputs=outputs, device=self.scores.device)
 
     def launch(
         self, boxes: wp.array, scores: wp.array, keep: wp.array, keep_count: wp.array, said: wp.array, least: float

@@ -48,6 +48,7 @@ class _Look:
         )
         self.rescore = BoxRescore(
             boxes=spec.max_boxes,
+            candidates=card.decode.max_objects,
             moved=tuple(name in spec.moved for name in card.classes),
             size_shares=tuple(spec.size_shares.get(name, 1.0) for name in card.classes),
             powers=tuple(spec.powers.get(name, 1.0) for name in card.classes),
@@ -166,20 +167,15 @@ class SecondStage:
             score_threshold: Least score of an object.
         """
         for look, cloud, (decode, nms) in zip(self._looks, clouds, found, strict=False):
-            look.gather.launch(
-                cloud[0],
-                cloud[1],
-                decode.boxes,
-                decode.scores,
-                decode.classes_found,
-                nms.keep,
-                nms.keep_count,
-                cloud[2],
-            )
+            first = (decode.scores, decode.classes_found)
+            look.rescore.choose(*first, nms.keep, nms.keep_count, score_threshold)
+            chosen = (look.rescore.chosen, look.rescore.chosen_count)
+            look.gather.launch(cloud[0], cloud[1], decode.boxes, *first, *chosen, cloud[2])
             if self._counted:
-                self._look_at(look, min(int(nms.keep_count.numpy()[0]), self._spec.max_boxes))
+                self._look_at(look, min(int(chosen[1].numpy()[0]), self._spec.max_boxes))
         if not self._counted:
             self._networks[0].run()
-        for look, (decode, nms) in zip(self._looks, found, strict=False):
-            look.rescore.launch(decode.boxes, decode.scores, nms.keep, nms.keep_count, look.arrays[2], score_threshold)
+        for look, (decode, _) in zip(self._looks, found, strict=False):
+            chosen = (look.rescore.chosen, look.rescore.chosen_count)
+            look.rescore.launch(decode.boxes, decode.scores, *chosen, look.arrays[2], score_threshold)
             look.nms.launch(look.rescore.boxes_out, look.rescore.scores, look.rescore.count)

@@ -12,7 +12,7 @@ POWERS = (1.0, 0.7, 1.2)
 
 
 def rescore(boxes, scores, keep, said, *, moved=(True, False, True), weights=(0.3, 0.5, 0.2), least=0.2, count=None):
-    plan = BoxRescore(boxes=MOST, moved=moved, size_shares=SHARES, powers=POWERS, weights=weights)
+    plan = BoxRescore(boxes=MOST, candidates=64, moved=moved, size_shares=SHARES, powers=POWERS, weights=weights)
 
     def array(values, dtype):
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
@@ -103,6 +103,7 @@ def test_a_network_that_says_nan_finds_nothing():
     ("wrong", "said"),
     [
         ({"boxes": 0}, "boxes"),
+        ({"candidates": 0}, "candidates"),
         ({"moved": ()}, "moved"),
         ({"weights": (0.5, 0.6, -0.1)}, "weights"),
         ({"size_shares": (2.0,)}, "size_shares"),
@@ -115,6 +116,7 @@ def test_wrong_arguments_are_refused(wrong, said):
         BoxRescore(
             **{
                 "boxes": 4,
+                "candidates": 9,
                 "moved": (True,),
                 "size_shares": (1.0,),
                 "powers": (1.0,),
@@ -127,3 +129,20 @@ def test_wrong_arguments_are_refused(wrong, said):
 def test_a_network_of_other_outputs_is_refused():
     with pytest.raises(ValueError, match="said"):
         rescore(np.ones((1, 7)), [0.9], [0], np.zeros((MOST, 11)))
+
+
+def test_boxes_that_cannot_reach_the_least_score_are_not_chosen():
+    """What is chosen is all that would do if the network were certain, in its order."""
+    rng = np.random.default_rng(9)
+    scores, kinds, keep = np.float32(rng.random(40)), rng.integers(0, KINDS, 40), rng.permutation(40)[:30]
+    plan = BoxRescore(
+        boxes=MOST, candidates=30, moved=(True,) * 3, size_shares=SHARES, powers=POWERS, weights=(0.4, 0.4, 0.2)
+    )
+    values = (scores, wp.float32), (np.int32(kinds), wp.int32), (np.int32(keep), wp.int32), (np.int32([25]), wp.int32)
+    given = [wp.array(value, dtype=dtype, device="cpu") for value, dtype in values]
+    plan.choose(*given, 0.6)
+    wanted = [b for b in keep[:25] if scores[b] ** (0.4 * POWERS[kinds[b]]) >= 0.6]
+    assert plan.chosen.numpy()[: plan.chosen_count.numpy()[0]].tolist() == wanted
+    assert 0 < len(wanted) < 25
+    with pytest.raises(ValueError, match="candidates"):
+        plan.choose(*given[:2], wp.zeros(31, dtype=wp.int32, device="cpu"), given[3], 0.6)
