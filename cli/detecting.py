@@ -82,7 +82,7 @@ def eval_detection(
     typer.echo(f"{page}")
 
 
-heads = typer.Typer(help="Detection heads: import, look at, quantise.", no_args_is_help=True)
+heads = typer.Typer(help="Detection heads: train, import, look at, quantise.", no_args_is_help=True)
 commands.add_typer(heads, name="head")
 
 
@@ -127,6 +127,52 @@ def import_head(
             f"to import a head takes {needed}, which is not installed: pip install 'warploom[torch]'"
         ) from error
     typer.echo(f"{card}")
+
+
+@heads.command("train", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def train(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(help="Folder for the checkpoint, and at the end the head's ONNX and YAML.")],
+    data: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--data",
+            metavar="URI",
+            help="Labelled scans to learn from as well, as of `warploom eval detection`: kitti:DIR, "
+            "kitti:DIR?sequence=0000, nuscenes:DIR; may be repeated.",
+        ),
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="List the further options, those of the training.")] = False,
+) -> None:
+    """Train a head on simulated scenes, or go on with one on labelled scans of your own.
+
+    Example: `warploom head train --data kitti:my_drives --start-from pillar_center.yaml --frozen --learning-rate 3e-4
+    --frames 200 --minutes 20 --out my_head`; `models/weights/pillar_center.yaml` is the head that ships. All options of
+    `python -m warploom.models.training` may follow: `--all` lists them.
+    """
+    from ..errors import ConfigError
+
+    try:
+        from ..models.training.__main__ import main
+    except ImportError as error:
+        needed = error.name or "torch"
+        raise ConfigError(f"to train takes {needed}, which is not installed: pip install 'warploom[torch]'") from error
+    training = typer.Typer(add_completion=False)
+    training.command()(main)
+    if everything:
+        training(["--help"], prog_name="warploom head train")
+    arguments = ["--out", str(out), *context.args]
+    if data:
+        from ..components.labelled_scans import write_labelled_scans
+
+        for uri in data:
+            typer.echo(f"{uri}: {write_labelled_scans(uri, out / 'labelled')} labelled scans")
+        arguments += ["--labelled", str(out / "labelled")]
+    try:
+        training(arguments, prog_name="warploom head train", standalone_mode=False)
+    except ImportError as error:
+        needed = error.name or "torch"
+        raise ConfigError(f"to train takes {needed}, which is not installed: pip install 'warploom[torch]'") from error
 
 
 @heads.command("show")

@@ -28,7 +28,14 @@ def main(
         list[str] | None, typer.Option(help="Also learn iou, vx or vy; vx and vy are not exported.")
     ] = None,
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
-    start_from: Annotated[Path | None, typer.Option(help="Begin with the weights of this checkpoint.")] = None,
+    start_from: Annotated[
+        Path | None,
+        typer.Option(help="Begin with the weights of this checkpoint, or of a head's card, whose network it then is."),
+    ] = None,
+    labelled: Annotated[
+        Path | None, typer.Option(help="Learn from the scans of this folder too: `warploom head train` writes them.")
+    ] = None,
+    labelled_share: Annotated[float, typer.Option(help="Share of the windows that are of those.")] = 0.5,
     learning_rate: Annotated[float, typer.Option(help="The highest of the cycle.")] = 3e-3,
     final_share: Annotated[float, typer.Option(help="What is left of it at the end.")] = 0.002,
     frozen: Annotated[
@@ -46,15 +53,24 @@ def main(
     workers: Annotated[int, typer.Option(help="Processes that simulate.")] = 1,
     workers_nice: Annotated[int, typer.Option(help="How far those stand back for other processes.")] = 10,
 ) -> None:
-    """Trains a pillar centre head on simulated scenes; interrupted, the same command goes on."""
+    """Trains a pillar centre head on simulated scenes, and on labelled scans; interrupted, the same command goes on."""
     from ...kernels.pillar import pillar_channels
-    from .export import export_head
+    from .export import CARDS, export_head, exported_shape, like
     from .loop import TrainingConfig, described, train
     from .network import LEAN_CHANNELS
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if minutes is None and iterations is None:
         minutes = 40.0
+    shape = {
+        "width": (stem, 48, 128),
+        "depth": (1, blocks),
+        "channels": LEAN_CHANNELS if lean else pillar_channels(),
+        "extras": tuple(extra or ()),
+    }
+    card = start_from if start_from is not None and start_from.suffix in CARDS else None
+    if card is not None:
+        shape = exported_shape(card)
     config = TrainingConfig(
         out=out,
         seed=seed,
@@ -62,10 +78,6 @@ def main(
         iterations=iterations,
         frames=frames,
         views=views,
-        width=(stem, 48, 128),
-        depth=(1, blocks),
-        channels=LEAN_CHANNELS if lean else pillar_channels(),
-        extras=tuple(extra or ()),
         frames_folder=frames_folder,
         start_from=start_from,
         learning_rate=learning_rate,
@@ -76,10 +88,15 @@ def main(
         loaders=int(loader),
         workers=workers,
         workers_nice=workers_nice,
+        labelled=labelled,
+        labelled_share=labelled_share,
+        **shape,
     )
     result = train(config)
-    card = export_head(result.network, out, training=described(config, result))
-    logging.getLogger(__name__).info("%d iterations in %.1f minutes: %s", result.iterations, result.minutes, card)
+    made = export_head(result.network, out, training=described(config, result))
+    if card is not None:
+        like(card, made)
+    logging.getLogger(__name__).info("%d iterations in %.1f minutes: %s", result.iterations, result.minutes, made)
 
 
 if __name__ == "__main__":

@@ -13,12 +13,14 @@ from typing import Protocol
 import numpy as np
 
 from ..classes import CYCLIST, PEDESTRIAN
+from ..geometry import points_in_boxes
 
 __all__ = [
     "Augmentation",
     "TrainingFrame",
     "augment",
     "labelled_boxes",
+    "labelled_frame",
     "load_frame",
     "save_frame",
     "simulate_frame",
@@ -49,6 +51,8 @@ class TrainingFrame:
     """Over ground along x and y [m/s], shape (k, 2), float32; of no rows where they are unknown."""
     bowed: bool = False
     """Whether its vehicles are bowed in plan and polished, as real ones are and those of earlier renderings are not."""
+    tight: bool = True
+    """Whether boxes are tight, as the simulator's are, or have the room that people who label scans leave."""
 
 
 class _Simulated(Protocol):
@@ -100,6 +104,42 @@ def _training_frame(frame: _Simulated) -> TrainingFrame:
     )
 
 
+def labelled_frame(
+    points: np.ndarray,
+    boxes: np.ndarray,
+    classes: np.ndarray,
+    sensor_height: float,
+    velocities: np.ndarray | None = None,
+) -> TrainingFrame:
+    """A real scan with its labels, to learn from.
+
+    Lasers are told by the beams' elevations, in 64 steps, as few data sets say them.
+
+    Args:
+        points: Where there are labels, in the sensor's frame, shape (n, 3 or more) [m].
+        boxes: Shape (k, 7).
+        classes: Indices into `models.classes.CLASSES`, shape (k,).
+        sensor_height: Above the ground [m].
+        velocities: Over ground along x and y, NaN where unknown, shape (k, 2) [m/s].
+    """
+    xyz = np.asarray(points, np.float32)[:, :3]
+    xyz = xyz[(np.abs(xyz) < _REACH).all(axis=1)]
+    boxes = np.asarray(boxes, np.float32).reshape(-1, 7)
+    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    low, high = (elevation.min(), elevation.max()) if len(xyz) else (0.0, 1.0)
+    return TrainingFrame(
+        xyz=xyz,
+        ring=np.clip((elevation - low) / max(high - low, 1e-6) * 64, 0, 63).astype(np.uint8),
+        boxes=boxes,
+        classes=np.asarray(classes, np.int32),
+        points_in=points_in_boxes(xyz, boxes, margin=0.05).sum(axis=1).astype(np.int32),
+        sensor_height=float(sensor_height),
+        velocities=np.empty((0, 2), np.float32) if velocities is None else np.asarray(velocities, np.float32),
+        bowed=True,
+        tight=False,
+    )
+
+
 def save_frame(path: Path, frame: TrainingFrame) -> None:
     """Writes a frame file; a reader never sees half of one."""
     partial = path.with_suffix(".partial.npz")
@@ -113,6 +153,7 @@ def save_frame(path: Path, frame: TrainingFrame) -> None:
         sensor_height=np.float32(frame.sensor_height),
         velocities=frame.velocities,
         bowed=np.bool_(frame.bowed),
+        tight=np.bool_(frame.tight),
     )
     os.replace(partial, path)
 
@@ -129,6 +170,7 @@ def load_frame(path: Path) -> TrainingFrame:
             sensor_height=float(stored["sensor_height"]),
             velocities=stored["velocities"] if "velocities" in stored else np.empty((0, 2), np.float32),
             bowed="bowed" in stored and bool(stored["bowed"]),
+            tight="tight" not in stored or bool(stored["tight"]),
         )
 
 
@@ -211,4 +253,5 @@ def augment(frame: TrainingFrame, rng: np.random.Generator, options: Augmentatio
         sensor_height=rng.uniform(-options.height, options.height),
         velocities=frame.velocities @ (matrix[:2, :2] / np.float32(scale)).T,
         bowed=frame.bowed,
+        tight=frame.tight,
     )

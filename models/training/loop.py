@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from ...kernels.pillar import PillarGrid, pillar_channels
 from .bowing import bowed
+from .export import CARDS, exported_weights
 from .frames import (
     Augmentation,
     TrainingFrame,
@@ -89,7 +90,12 @@ class TrainingConfig:
     """How far those stand back for other processes."""
     augmentation: Augmentation = field(default_factory=Augmentation)
     start_from: Path | None = None
-    """Checkpoint of another training, whose weights this one begins with, on a learning rate cycle of its own."""
+    """Checkpoint of another training, or card of a head in floating point, whose weights this one begins with, on a
+    learning rate cycle of its own."""
+    labelled: Path | None = None
+    """Folder of labelled scans to learn from as well, as `save_frame` writes them."""
+    labelled_share: float = 0.5
+    """Share of the windows that are drawn from them."""
 
     def __post_init__(self):
         if (self.minutes is None) == (self.iterations is None):
@@ -99,6 +105,10 @@ class TrainingConfig:
             raise ValueError(f"fresh must be from 1 to the batch, {self.batch}, not {self.fresh}")
         if self.loaders not in (0, 1):
             raise ValueError(f"loaders must be 0 or 1, not {self.loaders}")
+        if not 0 <= self.labelled_share <= 1:
+            raise ValueError(f"labelled_share must be 0 to 1, not {self.labelled_share}")
+        if self.frames < 1 and (self.labelled is None or self.labelled_share < 1):
+            raise ValueError(f"frames must be at least 1, not {self.frames}, unless all windows are of labelled scans")
         if self.views < 1:
             raise ValueError(f"views must be at least 1, not {self.views}")
         if cells != round(cells) or round(cells) % (4 * STRIDE):
@@ -161,7 +171,8 @@ def make_views(folder: Path, seeds: range, views: int, nice: int = 0) -> None:
 
 def _sample(frame: TrainingFrame, grid: PillarGrid, config: TrainingConfig, rng: np.random.Generator) -> Window:
     """One variation of a frame."""
-    frame = replace(frame, boxes=labelled_boxes(frame.boxes, frame.classes))
+    if frame.tight:
+        frame = replace(frame, boxes=labelled_boxes(frame.boxes, frame.classes))
     varied = augment(bowed(frame, rng), rng, config.augmentation)
     xyz = np.ascontiguousarray(varied.xyz)[: grid.capacity]
     points = wp.array(ptr=xyz.ctypes.data, dtype=wp.vec3, shape=(len(xyz),), device="cpu")
@@ -197,15 +208,32 @@ class _Fresh(IterableDataset):
             capacity=1 << 18, device="cpu",
         )  # fmt: skip
         look = _frames_there(config)
+        labelled = _labelled(config)
         iteration = self._start
         while True:
             rng = np.random.default_rng([config.seed, iteration])
             there = look()
             samples = []
-            for choice in rng.integers(len(there), size=config.fresh or config.batch):
-                samples.append(_sample(load_frame(there[choice]), grid, config, rng))
+            for choice in rng.integers(max(len(there), 1), size=config.fresh or config.batch):
+                real = labelled and rng.random() < config.labelled_share
+                path = labelled[rng.integers(len(labelled))] if real else there[choice]
+                samples.append(_sample(load_frame(path), grid, config, rng))
             yield samples
             iteration += 1
+
+
+def _labelled(config: TrainingConfig) -> list[Path]:
+    """The files of labelled scans.
+
+    Raises:
+        FileNotFoundError: There are none in the folder.
+    """
+    if config.labelled is None:
+        return []
+    found = sorted(path for path in config.labelled.glob("*.npz") if not path.name.endswith(".partial.npz"))
+    if not found:
+        raise FileNotFoundError(f"{config.labelled}: no scans (.npz) here; `warploom head train --data` writes them")
+    return found
 
 
 def _stand_back(_: int) -> None:
@@ -293,6 +321,7 @@ def train(config: TrainingConfig) -> TrainingResult:
     network = PillarCenterNet(config.width, config.depth, config.channels, config.extras).to(
         memory_format=torch.channels_last
     )
+    _labelled(config)  # what is not there is said before anything is simulated
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_running_average(config.average), use_buffers=True)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
@@ -306,6 +335,9 @@ def train(config: TrainingConfig) -> TrainingResult:
         optimiser.load_state_dict(state["optimiser"])
         iteration, spent = state["iteration"], state["minutes"]
         _log.info("resuming from iteration %d, minute %.1f", iteration, spent)
+    elif config.start_from is not None and config.start_from.suffix in CARDS:
+        network.begin_with(exported_weights(config.start_from, network))
+        _log.info("starting from the head of %s", config.start_from)
     elif config.start_from is not None:
         state = torch.load(config.start_from, weights_only=True)
         network.begin_with(averaged_weights(state))
@@ -392,8 +424,14 @@ def described(config: TrainingConfig, result: TrainingResult) -> dict[str, objec
         recipe["channels"] = list(config.channels)
     if config.extras:
         recipe["extras"] = list(config.extras)
+    data = "scenes of warploom's simulator alone"
+    if labelled := len(_labelled(config)):
+        data = f"{labelled} labelled scans of one's own"
+        if config.labelled_share < 1:
+            data += " and scenes of warploom's simulator"
+        recipe["labelled_share"] = config.labelled_share
     return {
-        "data": "scenes of warploom's simulator alone",
+        "data": data,
         "seed": config.seed,
         "frames": result.frames,
         "iterations": result.iterations,

@@ -74,7 +74,8 @@ def samples_of(found: Detections, frame: TrainingFrame, rng: np.random.Generator
         rng: Which points are kept of a candidate with many.
     """
     boxes, n = found.boxes, len(found)
-    truth_boxes = labelled_boxes(frame.boxes, frame.classes).astype(np.float32)
+    truth_boxes = labelled_boxes(frame.boxes, frame.classes) if frame.tight else frame.boxes
+    truth_boxes = np.asarray(truth_boxes, np.float32)
     known = frame.classes < len(HEAD_CLASSES)
     truth_boxes, kinds, points_in = truth_boxes[known], frame.classes[known], frame.points_in[known]
     meant = _meant(boxes, truth_boxes)

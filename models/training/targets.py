@@ -29,7 +29,7 @@ _WEIGHTS = torch.tensor([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0, 2.0, 0.3, 0.3])
 # Of the heat maps: people and riders are a third as many as vehicles, and look less alike.
 _CLASS_WEIGHTS = torch.tensor([1.0, 1.5, 1.5, 1.0, 1.0])
 # Of what a box lacks of its overlap: 0.2 m are much for a person and little for a bus, which L1 does not know.
-_OVERLAP_WEIGHT = 1.0
+_OVERLAP_WEIGHT = 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
