@@ -63,7 +63,7 @@ def test_what_cannot_be_learnt_from_is_named(kitti, tmp_path):
     with pytest.raises(SourceError):
         write_labelled_scans(f"kitti:{tmp_path / 'nowhere'}", tmp_path / "scans")
     (kitti / "label_2" / "000007.txt").write_text("Car 0.00 0\n")
-    with pytest.raises(SourceError, match="000007.txt, line 1"):
+    with pytest.raises(SourceError, match=r"000007\.txt, line 1"):
         write_labelled_scans(f"kitti:{kitti}", tmp_path / "scans")
 
 
