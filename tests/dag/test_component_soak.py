@@ -12,7 +12,7 @@ from warploom.dag import BacklogConfig, DagComponent, MonotonicDagComponent
 from warploom.datamesh import DataMesh, Status
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
-THREADS = 8
+THREADS, FEWEST = 8, 20
 
 
 def run(topic, seconds, seed, backlog, hand_off):
@@ -40,7 +40,8 @@ def run(topic, seconds, seed, backlog, hand_off):
     def commit(number):
         jitter = random.Random(seed * 100 + number)
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        # On a machine with much else to do, for as long as it takes to see something.
+        while time.monotonic() < end or (len(kept) <= FEWEST and time.monotonic() < end + 30):
             version = next(versions)
             time.sleep(jitter.random() * 2e-3)
             status = source.commit(version, version)
@@ -61,7 +62,7 @@ def run(topic, seconds, seed, backlog, hand_off):
 
 def check(topic, seconds, seed, backlog, hand_off):
     kept, result, losses, failed = run(topic, seconds, seed, backlog, hand_off)
-    assert len(kept) > 20
+    assert len(kept) > FEWEST
     assert set(kept) <= set(result.events), "what was kept was committed or settled to the end"
     assert list(result.entries) == sorted(result.entries), "in the order of versions"
     assert all(result.entries[version] == version for version in result.entries)

@@ -15,7 +15,9 @@ import warploom as wl
 import warploom.kernels
 from warploom.kernels.anchor_decode import AnchorDecode
 from warploom.kernels.bev import BevMaps
+from warploom.kernels.box_points import BoxPoints
 from warploom.kernels.box_refine import BoxRefine
+from warploom.kernels.box_rescore import RESIDUALS, BoxRescore
 from warploom.kernels.boxes import FitBoxes
 from warploom.kernels.camera import camera_model
 from warploom.kernels.cluster import EuclideanCluster
@@ -223,6 +225,31 @@ def refinement(given):
     return refined, launch
 
 
+def gathering_in_boxes(given):
+    plan = BoxPoints(capacity=N, boxes=24, points_of_box=32, classes=2, origin=(-25.0, -25.0), size=(50.0, 50.0))
+    kinds = wp.zeros(BOXES, dtype=wp.int32, device="cpu")
+    keep = wp.array(np.arange(BOXES, dtype=np.int32)[::-1].copy(), device="cpu")
+    cloud, boxes = (given.xyz, given.count), (given.boxes, given.scores, kinds)
+    return plan, lambda: plan.launch(*cloud, *boxes, keep, given.box_count, given.sensor_height)
+
+
+def rescoring(given):
+    plan = BoxRescore(
+        boxes=16, candidates=BOXES, moved=(True, False), size_shares=(1.0, 0.5), powers=(1.0, 1.2),
+        weights=(0.4, 0.4, 0.2),
+    )  # fmt: skip
+    kinds = wp.array(np.arange(BOXES, dtype=np.int32) % 2, device="cpu")
+    keep = wp.array(np.arange(BOXES, dtype=np.int32), device="cpu")
+    columns = 4 + len(RESIDUALS)
+    said = given.maps.flatten()[: 16 * columns].reshape((16, columns))
+
+    def launch():
+        plan.choose(given.scores, kinds, keep, given.box_count, 0.3)
+        plan.launch(given.boxes, given.scores, plan.chosen, plan.chosen_count, said, 0.3)
+
+    return plan, launch
+
+
 def selection(given):
     plan = Selected()
     return plan, lambda: select_heights(given.include, given.height, given.count, (0.2, 3.0), plan.selected)
@@ -244,6 +271,8 @@ CASES = {
         BevMaps, "xyz", "intensity", "count", capacity=N, point_range=RANGE, shape=(60, 50), method="shared"
     ),
     "boxes refined": refinement,
+    "boxes rescored": rescoring,
+    "points of boxes": gathering_in_boxes,
     "boxes by shape": simple(FitBoxes, "xyz", "labels", "count", capacity=N, max_clusters=24),
     "boxes by area": simple(FitBoxes, "xyz", "labels", "count", capacity=N, max_clusters=64, method="min_area"),
     "cluster": simple(EuclideanCluster, "xyz", "count", "include", radius=0.5, min_size=2, capacity=N),
