@@ -341,7 +341,10 @@ class Output(_Handle[T]):
 
     def allocate_change(self) -> Change[T]:
         """A new change, to be written and committed."""
-        return Change(self._window or self.window, self.epoch)
+        window = self._window or self.window
+        if window.on_begin is not None:
+            window.on_begin()
+        return Change(window, self.epoch)
 
     def commit(
         self,

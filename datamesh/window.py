@@ -79,6 +79,8 @@ class Window(Generic[T]):
         self.check = check
         self.arena: Callable[[], Arena] | None = None
         """Gives the memory in which a payload is built that other processes read; None: this process's own."""
+        self.on_begin: Callable[[], None] | None = None
+        """Is told that a change is begun, for who has to get ready for its commit."""
         self.state: State[T] = State.empty(0)
         """What it holds: immutable, and replaced by each commit."""
         self._lock = threading.Lock()

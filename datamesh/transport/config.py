@@ -25,7 +25,7 @@ class SharedMemoryConfig(BaseModel):
     kept_s: float = Field(10.0, ge=0.0)
     """For how long [s]."""
     announce: bool = True
-    """Whether readers are woken when a payload is begun that is built in place, so as to be ready for it."""
+    """Whether readers are woken when a change is begun, so as to be ready for its commit."""
     spin_us: float = Field(1000.0, ge=0.0)
     """For how long a reader stays awake, at most, for a datum that is announced and due; 0: it sleeps [µs]."""
     spin_share: float = Field(0.1, ge=0.0, le=1.0)

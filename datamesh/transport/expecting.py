@@ -7,8 +7,9 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
-__all__ = ["Durations", "Expectation", "current_core", "leave_core"]
+__all__ = ["Aside", "Durations", "Expectation", "current_core"]
 
 _REMEMBERED = 8
 _SAVED_NS = 5_000_000
@@ -21,15 +22,46 @@ current_core: Callable[[], int] = ctypes.PyDLL(None).sched_getcpu  # which keeps
 """On which core the calling thread runs."""
 
 
-def leave_core(core: int) -> None:
-    """Moves the calling thread to another core, if it is on this one and may run elsewhere.
+class Aside:
+    """Where the thread that receives waits: on another core than the one of its writer.
 
-    Linux likes to wake a thread on the core of who wakes it by a socket, as if that were about to sleep. Who stays
-    awake there takes the core from the one it waits for.
+    Linux likes to wake a thread on the core of who wakes it by a socket, as if that were about to sleep; kernels that
+    would rather not wake a core do nothing else. There it runs once the writer sleeps, which is after the commit, or
+    takes the core from it. What runs once a datum is there may run everywhere again.
     """
-    if current_core() == core and len(cores := os.sched_getaffinity(0)) > 1:
-        os.sched_setaffinity(0, cores - {core})
-        os.sched_setaffinity(0, cores)
+
+    def __init__(self) -> None:
+        """It waits anywhere."""
+        self._core = -1
+        self._everywhere: set[int] = set()
+        self._here: set[int] = set()
+
+    def avoid(self, core: int) -> None:
+        """Notes on which core its writer runs, and leaves that."""
+        if core != self._core:
+            self.end()
+            self._core = core
+        if not self._here:
+            self.begin()
+
+    def begin(self) -> None:
+        """From here on the calling thread is not on its writer's core, if it may run on another."""
+        if self._core < 0:
+            return
+        cores = os.sched_getaffinity(0)
+        here = cores - {self._core}
+        if here and here != cores:
+            with suppress(OSError):  # the last of these cores was taken from this process just now
+                os.sched_setaffinity(0, here)
+                self._everywhere, self._here = cores, here
+
+    def end(self) -> None:
+        """It may run where it could before, unless somebody has moved it meanwhile."""
+        if self._here:
+            if os.sched_getaffinity(0) == self._here:
+                with suppress(OSError):
+                    os.sched_setaffinity(0, self._everywhere)
+            self._here = set()
 
 
 class Durations:
@@ -67,6 +99,11 @@ class Expectation:
         self._share = share
         self._saved = self._pause = self._skip = 0
         self._counted = time.perf_counter_ns()
+
+    @property
+    def is_worth_it(self) -> bool:
+        """Whether it may stay awake at all, and data come when they are due."""
+        return self._most > 0 and not self._skip
 
     def came(self, awake_ns: int, in_vain: bool) -> None:
         """Notes for how long the reader stayed awake for a datum [ns], and whether that came later all the same."""

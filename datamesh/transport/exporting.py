@@ -59,7 +59,7 @@ _log = logging.getLogger(__name__)
 
 _ndarray = np.ndarray
 _COUNTING_S = 0.1
-_COLD_NS = 2_000_000
+_COLD_NS = 800_000
 """After a pause of this length a processor's caches hold other things than what receives a datum [ns]."""
 _NAMES = 256
 """Of how many readers it is known what they were sent, for when they come back."""
@@ -120,6 +120,7 @@ class Exporter:
             self._listener.close()
             raise
         window.arena = self._arena
+        window.on_begin = self._on_begin
         self._unsubscribe = window.subscribe(self._on_commit, self._on_settle)
         service.watch(self._listener, select.EPOLLIN, self._accept)
 
@@ -138,7 +139,7 @@ class Exporter:
     def stop(self) -> None:
         """Ends the export. What readers hold stays theirs."""
         self._stopped = True
-        self._window.arena = None
+        self._window.arena = self._window.on_begin = None
         self._unsubscribe()
         with self._lock:
             unlisten(self._node, self._window.topic)
@@ -153,18 +154,20 @@ class Exporter:
         snapshot = window.snapshot()
         return snapshot.epoch, snapshot.versions[-1] if len(snapshot) else -1
 
-    # Memory
-
-    def _arena(self) -> SlabArena:
+    def _on_begin(self) -> None:
         self._begun_ns = now = time.perf_counter_ns()
         if self._config.announce and now - self._told_ns > _COLD_NS:
             self._announce(now)
+
+    # Memory
+
+    def _arena(self) -> SlabArena:
         arena = SlabArena(self._lease, self._built.size, partial(self._count, "no_memory"))
         self._built = arena.used
         return arena
 
     def _announce(self, begun_ns: int) -> None:
-        """Wakes the readers while the payload is built, for them to be ready when it comes."""
+        """Wakes the readers while a datum is built, for them to be ready when it comes."""
         soon, late = self._due_ns
         message = pack_soon(current_core(), begun_ns + soon, begun_ns + late)
         for reader in tuple(self._readers):

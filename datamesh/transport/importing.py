@@ -25,7 +25,7 @@ from ..policy import CommitPolicy, EqualVersion
 from ..snapshot import Entry
 from ..window import Window
 from .config import SharedMemoryConfig
-from .expecting import Expectation, leave_core
+from .expecting import Aside, Expectation
 from .places import connect, peer_of
 from .slabs import Region
 from .wire import (
@@ -37,6 +37,7 @@ from .wire import (
     SETTLE,
     SOON,
     Event,
+    new_event,
     pack_greeting,
     read_event,
     read_greeting,
@@ -79,6 +80,7 @@ class _Connection:
         self._waiting: deque[bytes] = deque()
         self._scratch = scratch  # takes in rehearsals what the topic's window takes otherwise
         self._rehearsals = 0
+        self.aside = Aside()
         self.busy = False
         """While a datum is being read, it is told afterwards which slabs are no longer needed."""
 
@@ -89,7 +91,8 @@ class _Connection:
     def rehearse(self, event: Event, value: Any) -> None:
         """Commits to where nobody sees it."""
         self._rehearsals += 1
-        publish(self._scratch, event._replace(epoch=0, version=self._rehearsals, newest=True), value)
+        again = new_event((*event[:2], 0, self._rehearsals, *event[4:7], True, *event[8:]))  # `_replace` takes longer
+        publish(self._scratch, again, value)
 
     def forget_rehearsals(self) -> None:
         """Lets go of the last of them, which else kept the memory for as long as the garbage collector leaves it."""
@@ -269,15 +272,18 @@ class Importer:
         try:
             return self._receive_all(connection)
         finally:
+            connection.aside.end()
             self._window.put_off(False)
 
     def _receive_all(self, connection: _Connection) -> bool:
         number, last, came = 0, b"", None
         window, receive, memory = self._window, connection.socket.recv, connection.region.size
         expectation = Expectation(round(self._config.spin_us * 1e3), self._config.spin_share)
-        flags, more = 0, False
+        flags, more, aside = 0, False, connection.aside
         while True:
             try:
+                if not flags and expectation.is_worth_it:
+                    aside.begin()
                 data = receive(MESSAGE, flags)
                 while data[:1] == _SOON and not more:
                     if came is not None:  # the one before was abandoned
@@ -292,6 +298,7 @@ class Importer:
                 continue
             except OSError:
                 data = b""
+            aside.end()
             if not data:
                 return not self._stopping.is_set()
             if flags and not more:  # it had come while a component ran in this thread: there may be more behind it
@@ -378,19 +385,20 @@ def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> 
     one = connection.socket
     receive = one.recv
     core, soon, late = read_soon(word)
-    if allowed > 0:
-        leave_core(core)
-    left = soon - now()
-    if left < _SHORT_NS:  # it is as good as there
+    if allowed <= 0:
+        if soon - now() >= _SHORT_NS and last:
+            _rehearse(connection, last)
         return receive(MESSAGE), (0, False)
-    nap = left - _LEAD_NS
-    if nap > _NAP_NS and allowed > 0 and one.fileno() < _SELECTABLE:
+    aside = connection.aside
+    aside.avoid(core)
+    nap = soon - now() - _LEAD_NS
+    if nap > _NAP_NS and one.fileno() < _SELECTABLE:
         select.select((one,), (), (), nap / 1e9)
+    aside.end()  # it is not woken by a socket from here on, and when the datum is there every call counts
     if last:
         _rehearse(connection, last)
     here = awake = now()
-    until = min(late, here + allowed)
-    again = here + _WARM_NS
+    again, until = here + _WARM_NS, min(late, here + allowed)
     while here < until:
         try:
             data = receive(MESSAGE, _DONT_WAIT)
@@ -398,9 +406,7 @@ def _expect(connection: _Connection, word: bytes, allowed: int, last: bytes) -> 
             if (here := now()) > again and last:
                 _rehearse(connection, last)
                 here, begun = now(), here
-                again = here + max(
-                    _WARM_NS, 2 * (here - begun)
-                )  # a datum may come meanwhile: at most a third is spent so
+                again = here + max(_WARM_NS, 2 * (here - begun))  # a datum may come meanwhile: at most a third of it
             continue
         return data, (here - awake, False)
     return receive(MESSAGE), (here - awake, here > awake)
@@ -410,8 +416,10 @@ def _rehearse(connection: _Connection, data: bytes) -> None:
     """Does with the last commit what is to be done with the next, to no effect."""
     event = read_event(data, connection.region.size)
     if not event.body_size:
-        with suppress(ValueError):  # the memory may hold something else by now
+        try:
             connection.rehearse(event, _value(connection.region, event, _let_go_of_nothing))
+        except ValueError:  # the memory holds something else by now
+            return
 
 
 def _let_go_of_nothing(offset: int) -> None:

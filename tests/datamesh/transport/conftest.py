@@ -79,7 +79,7 @@ def private():
 class Side:
     """One mesh and its links."""
 
-    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), remote=None, zenoh=None, **config):
+    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), remote=None, zenoh=None, reads=None, **config):
         self.mesh = DataMesh(capacity)
         self.plan = LinkPlan(tuple(exports), tuple(imports), tuple(blocking), remote or {})
         config = SharedMemoryConfig(**{"memory_bytes": 1 << 24, "retry_ms": 2.0, **config})
@@ -92,6 +92,8 @@ class Side:
                 lambda entry, topic=topic: self.commits[topic].append((entry.epoch, entry.version, entry.triggers)),
                 lambda version, epoch, topic=topic: self.settled[topic].append((epoch, version)),
             )
+            if reads is not None:  # an event: it reads on once that is set
+                self.mesh.window(topic).subscribe(lambda entry: reads.wait(PATIENCE), lambda *_: None)
         self.links.start()
 
     def output(self, topic):

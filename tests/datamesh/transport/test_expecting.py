@@ -1,5 +1,6 @@
 """For how long a reader stays awake: bounded for each datum, bounded of all time, and not where it does not help."""
 
+import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 
 from warploom.datamesh.transport import expecting
-from warploom.datamesh.transport.expecting import Durations, Expectation, current_core, leave_core
+from warploom.datamesh.transport.expecting import Aside, Durations, Expectation, current_core
 
 MOST = 1_000_000
 
@@ -112,32 +113,97 @@ def in_a_thread(work):
         return pool.submit(work).result()
 
 
-def test_who_is_on_the_core_of_the_writer_leaves_it():
-    def leave():
-        allowed = os.sched_getaffinity(0)
-        here = current_core()
-        os.sched_setaffinity(0, {here})
-        os.sched_setaffinity(0, allowed)
-        leave_core(here)
-        return allowed, os.sched_getaffinity(0), here, current_core()
-
-    if len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("this process has one core")
-    tries = [in_a_thread(leave) for _ in range(20)]
-    assert all(before == after for before, after, _, _ in tries), "it may run everywhere again"
-    assert any(here != there for _, _, here, there in tries), "unless it is moved back at once"
+two_cores = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this process has one core")
 
 
-def test_who_is_elsewhere_or_has_one_core_stays(monkeypatch):
+@two_cores
+def test_who_waits_does_not_run_on_the_core_of_its_writer_and_afterwards_everywhere():
+    def wait():
+        everywhere, writers = os.sched_getaffinity(0), current_core()
+        aside = Aside()
+        aside.begin()
+        before_any = os.sched_getaffinity(0)
+        aside.avoid(writers)
+        waits, here = os.sched_getaffinity(0), current_core()
+        aside.end()
+        after = os.sched_getaffinity(0)
+        aside.begin()
+        return everywhere, writers, before_any, waits, here, after, os.sched_getaffinity(0)
+
+    everywhere, writers, before_any, waits, here, after, again = in_a_thread(wait)
+    assert before_any == everywhere, "of no writer it is known where that runs"
+    assert waits == again == everywhere - {writers}
+    assert here != writers
+    assert after == everywhere
+
+
+@two_cores
+def test_a_writer_that_moves_is_left_again():
+    def follow():
+        first, second, *_ = everywhere = sorted(os.sched_getaffinity(0))
+        aside = Aside()
+        seen = []
+        for core in (first, first, second, first):
+            aside.avoid(core)
+            seen.append((core, current_core(), os.sched_getaffinity(0)))
+        return set(everywhere), seen
+
+    everywhere, seen = in_a_thread(follow)
+    for core, here, waits in seen:
+        assert here != core
+        assert waits == everywhere - {core}
+
+
+@two_cores
+def test_who_was_moved_by_somebody_else_meanwhile_stays_there():
+    def wait():
+        first = min(os.sched_getaffinity(0))
+        aside = Aside()
+        aside.avoid(first)
+        os.sched_setaffinity(0, {first})
+        aside.end()
+        moved = os.sched_getaffinity(0)
+        aside.begin()
+        return first, moved, os.sched_getaffinity(0)
+
+    first, moved, waits = in_a_thread(wait)
+    assert moved == waits == {first}
+
+
+def test_who_may_run_nowhere_else_stays(monkeypatch):
     def refuse(*_):
         raise AssertionError("moved")
 
     def stay():
-        cores = os.sched_getaffinity(0)
-        here = min(cores)
+        here = min(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {here})
         monkeypatch.setattr(os, "sched_setaffinity", refuse)
-        leave_core(here)
-        leave_core(here + 1)
+        aside = Aside()
+        for core in (here, here + 1):
+            aside.avoid(core)
+            aside.end()
 
     in_a_thread(stay)
+
+
+def test_a_core_that_is_taken_away_meanwhile_is_no_error(monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    aside = Aside()
+    aside.avoid(0)
+    aside.end()
+
+
+def test_it_steps_aside_only_where_it_may_stay_awake_and_data_come_when_they_are_due(passes):
+    assert not Expectation(0, 0.1).is_worth_it
+    expectation = Expectation(MOST, 0.1)
+    assert expectation.is_worth_it
+    expectation.came(100, True)
+    assert not expectation.is_worth_it
+    for _ in range(2):
+        passes(10**8)
+        expectation.came(0, False)
+    assert expectation.is_worth_it

@@ -1,6 +1,7 @@
 """What is kept for a reader that was killed, until it is back."""
 
 import socket
+import threading
 
 import pytest
 
@@ -12,7 +13,7 @@ class Killed:
     """A reader that ends without a word, as one does that is killed."""
 
     def __init__(self, side, **options):
-        self._make = lambda: side("reader", imports=["topic"], **options)
+        self._make = lambda **others: side("reader", imports=["topic"], **options, **others)
         self.side = self._make()
 
     def kill(self, writer):
@@ -21,8 +22,8 @@ class Killed:
         link._socket.shutdown(socket.SHUT_RDWR)
         writer.until(lambda counts: counts["readers"] == 0, "topic")
 
-    def back(self):
-        self.side = self._make()
+    def back(self, **others):
+        self.side = self._make(**others)
         return self.side
 
 
@@ -50,16 +51,19 @@ def test_all_of_it_comes_in_order_and_triggers_once(side, built):
 
 
 def test_what_is_committed_while_it_catches_up_comes_behind(side, built):
-    # In one process a reader that stays awake takes the interpreter from its writer, and may be too slow for the rest.
-    writer = side("writer", exports=["topic"], capacity=2, queue=1, announce=False)
+    writer = side("writer", exports=["topic"], capacity=2, queue=1)
     reader = Killed(side, capacity=2, queue=1)
     writer.until(lambda counts: counts["readers"] == 1, "topic")
     reader.kill(writer)
     for version in range(1, 31):
         writer.commit("topic", version, built(version))
-    back = reader.back()
+    reads = threading.Event()
+    back = reader.back(reads=reads)
+    back.wait(lambda: back.commits["topic"])
     for version in range(31, 61):
         writer.commit("topic", version, built(version))
+    assert len(back.commits["topic"]) == 1
+    reads.set()
     back.until_shown(60)
     assert [version for _, version, _ in back.commits["topic"]] == list(range(1, 61))
 
