@@ -79,7 +79,9 @@ def private():
 class Side:
     """One mesh and its links."""
 
-    def __init__(self, node, name, exports=(), imports=(), capacity=8, blocking=(), remote=None, zenoh=None, reads=None, **config):
+    def __init__(
+        self, node, name, exports=(), imports=(), capacity=8, blocking=(), remote=None, zenoh=None, reads=None, **config
+    ):
         self.mesh = DataMesh(capacity)
         self.plan = LinkPlan(tuple(exports), tuple(imports), tuple(blocking), remote or {})
         config = SharedMemoryConfig(**{"memory_bytes": 1 << 24, "retry_ms": 2.0, **config})
