@@ -1,7 +1,7 @@
 """Scans with truth for the evaluation of a detection head, from data sets as they lie on disk and from the simulator.
 
 A URI names each: `kitti:DIR?sequence=0000&every=5` (object or tracking set; scans in `velodyne` or, losslessly packed,
-in `velodyne_packed`), `sim:street?seed=3&every=10` (a drive), `sim:scenes?seeds=500-529&lidar=hdl64` (one scan of each
+in `velodyne_packed`), `sim:street?seed=3&every=10` (a drive; `seeds=500-559`: one for each), `sim:scenes?seeds=500-529&lidar=hdl64` (one scan of each
 random scene; people's boxes as labels have them, see `models.training.frames.labelled_boxes`), `nuscenes:DIR` (key
 frames with an mmdetection3d `info.json`), `range:DIR?labels=semantic_kitti` (range images with a class for each pixel).
 Every one takes `height`, the sensor's above the ground [m].
@@ -165,7 +165,15 @@ def _kitti(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFra
 def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFrame]:
     from ...models.simulator import Simulator, sample_scene
     from ...models.training.frames import height_over_ground, labelled_boxes
+    from .tracking_objects import drive_uris
 
+    if place != "scenes" and "seeds" in keys:
+        drives = drive_uris(uri)
+        if drives == [uri]:
+            raise ConfigError(f"{uri}: seeds is {keys['seeds']!r}; write it as 500-559")
+        for drive in drives:
+            yield from evaluation_frames(drive)
+        return
     if place == "scenes":
         options = _Keys(uri, keys, ("seeds", "lidar", "height"))
         seeds = options.get("seeds", _seeds, range(500, 530))

@@ -146,6 +146,8 @@ def test_what_has_no_counterpart_is_told(kitti, caplog):
         ("sim:scenes?seeds=9-3", ConfigError, "seeds is '9-3'"),
         ("sim:scenes?seeds=1000000-1000001", ConfigError, "are trained on"),
         ("sim:mars", ConfigError, "scenario must be one of"),
+        ("sim:street?seeds=9-3", ConfigError, "holds no seed"),
+        ("sim:street?seeds=9", ConfigError, "seeds is '9'; write it as"),
         ("nuscenes:/nowhere", SourceError, "No such file"),
         ("range:/nowhere", SourceError, "no range images"),
         ("range:/nowhere?labels=x", ConfigError, "labels must be one of"),
@@ -161,6 +163,14 @@ def test_simulated_scenes_come_with_their_truth():
     assert [scene.name for scene in scenes] == ["scene 500"]
     assert all(len(scene.boxes) == len(scene.types) == len(scene.counts) > 0 for scene in scenes)
     assert all(1.0 < scene.sensor_height < 3.0 for scene in scenes)
+
+
+def test_several_drives_are_one_after_the_other():
+    frames = list(evaluation_frames("sim:street?seeds=500-501&lidar=vlp16&duration=0.4&every=2"))
+    one = list(evaluation_frames("sim:street?seed=501&lidar=vlp16&duration=0.4&every=2"))
+    names = [f"street {seed}, frame {index}" for seed in (500, 501) for index in (0, 2)]
+    assert [frame.name for frame in frames] == names
+    assert all(np.array_equal(a.points, b.points) for a, b in zip(frames[2:], one, strict=True))
 
 
 @pytest.mark.real
