@@ -1,10 +1,11 @@
 """Scans with truth for the evaluation of a detection head, from data sets as they lie on disk and from the simulator.
 
 A URI names each: `kitti:DIR?sequence=0000&every=5` (object or tracking set; scans in `velodyne` or, losslessly packed,
-in `velodyne_packed`), `sim:street?seed=3&every=10` (a drive; `seeds=500-559`: one for each), `sim:scenes?seeds=500-529&lidar=hdl64` (one scan of each
-random scene; people's boxes as labels have them, see `models.training.frames.labelled_boxes`), `nuscenes:DIR` (key
-frames with an mmdetection3d `info.json`), `range:DIR?labels=semantic_kitti` (range images with a class for each pixel).
-Every one takes `height`, the sensor's above the ground [m].
+in `velodyne_packed`), `sim:street?seed=3&every=10` (a drive; `seeds=500-559`: one for each),
+`sim:scenes?seeds=500-529&lidar=hdl64` (one scan of each random scene; people's boxes as labels have them, see
+`models.training.frames.labelled_boxes`), `nuscenes:DIR` (key frames with an mmdetection3d `info.json`),
+`range:DIR?labels=semantic_kitti` (range images with a class for each pixel). Every one takes `height`, the sensor's
+above the ground [m].
 """
 
 from __future__ import annotations
