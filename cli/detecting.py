@@ -55,16 +55,25 @@ def eval_detection(
 
     review = Review.read(reviewed) if reviewed is not None else None
     if detections is None:
+        from pydantic import ValidationError
+
+        from ..components.perception.detection import DetectionConfig
         from ..components.profile import execution_context, load_profile
         from ..models.heads import open_head
 
         file = load_profile(profile)
+        named = file.content.settings.get("perception.detect.providers")
+        try:
+            providers = DetectionConfig(providers=named).providers
+        except ValidationError as error:
+            raise file.error(["settings", "perception.detect.providers"], error.errors()[0]["msg"]) from None
         context = execution_context(file, device or file.content.device)
         judged = open_head(
             head or context.detector,
             device=context.device,
             threads=context.inference_threads,
             precision=context.precision,
+            providers=providers,
             score_threshold=LEAST_SCORE,
             capacity=context.capacity,
         )
@@ -129,6 +138,16 @@ def import_head(
     typer.echo(f"{card}")
 
 
+def _list_all(wanted: bool) -> None:
+    if not wanted:
+        return
+    from ..models.training.__main__ import main
+
+    training = typer.Typer(add_completion=False)
+    training.command()(main)
+    training(["--help"], prog_name="warploom head train")
+
+
 @heads.command("train", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def train(
     context: typer.Context,
@@ -142,7 +161,12 @@ def train(
             "kitti:DIR?sequence=0000, nuscenes:DIR; may be repeated.",
         ),
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="List the further options, those of the training.")] = False,
+    everything: Annotated[
+        bool,
+        typer.Option(
+            "--all", is_eager=True, callback=_list_all, help="List the further options, those of the training."
+        ),
+    ] = False,
 ) -> None:
     """Train a head on simulated scenes, or go on with one on labelled scans of your own.
 
@@ -159,8 +183,6 @@ def train(
         raise ConfigError(f"to train takes {needed}, which is not installed: pip install 'warploom[torch]'") from error
     training = typer.Typer(add_completion=False)
     training.command()(main)
-    if everything:
-        training(["--help"], prog_name="warploom head train")
     arguments = ["--out", str(out), *context.args]
     if data:
         from ..components.labelled_scans import write_labelled_scans
@@ -186,9 +208,9 @@ def show_head(
     import yaml
 
     from ..models.card import DEFAULT_CARD
-    from ..models.heads import read_card
+    from ..models.heads import check_head
 
-    read, model = read_card(card or DEFAULT_CARD)
+    read, model = check_head(card or DEFAULT_CARD)
     typer.echo(yaml.safe_dump(read.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=100).rstrip())
     typer.echo(f"# {model}: {model.stat().st_size / 1e6:.1f} MB, as the card says")
 

@@ -18,7 +18,7 @@ from ..errors import ModelError
 from .card import ModelCard, default_card, read_yaml
 from .detections import Detections
 
-__all__ = ["KINDS", "LidarHead", "card_kind", "open_head", "read_card"]
+__all__ = ["KINDS", "LidarHead", "card_kind", "check_head", "open_head", "read_card"]
 
 KINDS = {
     "pillar_center": ("head", "DetectionHead", "card", "HeadCard"),
@@ -87,16 +87,34 @@ def read_card(path: str | Path) -> tuple[ModelCard, Path]:
     return load_card(path, _named(module, name))
 
 
+def check_head(path: str | Path) -> tuple[ModelCard, Path]:
+    """What `read_card` gives, of a head that was opened on the CPU to see whether card and model fit.
+
+    Raises:
+        ModelError: They do not, or one is missing or not valid.
+    """
+    checked = read_card(path)
+    module, name, _, _ = KINDS[card_kind(path)]
+    _named(module, name)(path)
+    return checked
+
+
 def open_head(card: str | Path | None = None, **options: Any) -> Any:
-    """The head of a card, of whatever kind.
+    """The head of a LiDAR's card, of whatever kind.
 
     Args:
         card: The YAML file; None is the head that ships with warploom.
         options: Of the head's class: device, threads, precision, providers, score_threshold, capacity.
 
     Raises:
-        ModelError: The card or its model is missing, not valid, or the two do not fit.
+        ModelError: The card or its model is missing, not valid, the two do not fit, or the head is a camera's.
     """
     path = card or default_card(str(options.get("device", "cpu")))
-    module, name, _, _ = KINDS[card_kind(path)]
+    kind = card_kind(path)
+    module, name, _, _ = KINDS[kind]
+    if module.startswith("camera."):
+        read_card(path)
+        raise ModelError(
+            f"{path}: a head of the kind {kind} is for images; one for the points of a LiDAR is wanted here"
+        )
     return _named(module, name)(path, **options)

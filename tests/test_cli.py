@@ -94,10 +94,33 @@ def test_frames_limits_the_run(warploom, scans, tmp_path):
         (["check", "missing.yaml"], 2, "there is no such file"),
         (["graph", "perception", "--format", "jpeg"], 2, "neither text nor mermaid nor svg"),
         (["--log-level", "loud", "info"], 2, "none of debug"),
+        (["head", "train", "--out", "x", "--minutes", "1", "--iterations", "2"], 2, "either minutes or iterations"),
+        (["head", "train", "--all"], 0, "--learning-rate"),
     ],
 )
 def test_bad_usage_says_what_and_ends_with_its_code(warploom, arguments, code, message):
     assert message in " ".join(warploom(*arguments, expect=code).split())
+
+
+@pytest.mark.parametrize(
+    ("providers", "code", "message"),
+    [
+        ("[tensorrt, cpu]", 0, "no provider tensorrt here"),
+        ("[cuda]", 2, "add cpu to fall back"),
+        ("[gpu]", 2, "'cuda'"),
+    ],
+)
+def test_heads_are_evaluated_where_the_profile_says(warploom, tmp_path, providers, code, message):
+    profile = tmp_path / "mine.yaml"
+    profile.write_text(
+        f"profile: mine\nmodules: [perception]\nsettings: {{perception.detect.providers: {providers}}}\n"
+    )
+    scene = "sim:scenes?seeds=500&lidar=vlp16"
+    out = ["--out", str(tmp_path / "out"), "--pictures", "0"]
+    said = warploom("eval", "detection", "--profile", str(profile), "--data", scene, *out, expect=code)
+    assert message in " ".join(said.split())
+    if not code:
+        assert message in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(("missing", "arguments"), [

@@ -75,14 +75,13 @@ def _import(
     letterbox = kind == "yolox"
     folder.mkdir(parents=True, exist_ok=True)
     copy = folder / f"{name}.onnx"
-    shutil.copyfile(model, copy)
     card = ImageDetectorCard(
         name=name,
         kind=kind,
         description=f"{kind}, imported from {model.name}.",
         file=copy.name,
-        sha256=file_sha256(copy),
-        opset=opset(copy.read_bytes()),
+        sha256=file_sha256(model),
+        opset=opset(model.read_bytes()),
         input=ImageSpec(
             name=source,
             shape=(1, 3, *shape[2:]),
@@ -98,8 +97,9 @@ def _import(
     )
     path = folder / f"{name}.yaml"
     if contradiction := card.contradiction():
-        copy.unlink()
         raise ModelError(f"{model}: not a {kind} of {len(classes)} classes: {contradiction}")
+    if model.resolve() != copy.resolve():
+        shutil.copyfile(model, copy)
     save_card(path, card)
     load_card(path, ImageDetectorCard)
     return path

@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the checkpoint, and at the end the head's ONNX and YAML.")],
     seed: Annotated[int, typer.Option(help="Of weights, draws and variations.")] = 0,
-    minutes: Annotated[float | None, typer.Option(help="Train this long.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Train this long; without --iterations 40.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Train this far instead: reproducible to the bit.")] = None,
     frames: Annotated[int, typer.Option(help="Simulated scans to learn from.")] = 2000,
     views: Annotated[int, typer.Option(help="Scans of each simulated street: more cost less time a scan.")] = 1,
@@ -71,27 +71,30 @@ def main(
     card = start_from if start_from is not None and start_from.suffix in CARDS else None
     if card is not None:
         shape = exported_shape(card)
-    config = TrainingConfig(
-        out=out,
-        seed=seed,
-        minutes=minutes,
-        iterations=iterations,
-        frames=frames,
-        views=views,
-        frames_folder=frames_folder,
-        start_from=start_from,
-        learning_rate=learning_rate,
-        final_share=final_share,
-        frozen=frozen,
-        fresh=fresh,
-        threads=threads,
-        loaders=int(loader),
-        workers=workers,
-        workers_nice=workers_nice,
-        labelled=labelled,
-        labelled_share=labelled_share,
-        **shape,
-    )
+    try:
+        config = TrainingConfig(
+            out=out,
+            seed=seed,
+            minutes=minutes,
+            iterations=iterations,
+            frames=frames,
+            views=views,
+            frames_folder=frames_folder,
+            start_from=start_from,
+            learning_rate=learning_rate,
+            final_share=final_share,
+            frozen=frozen,
+            fresh=fresh,
+            threads=threads,
+            loaders=int(loader),
+            workers=workers,
+            workers_nice=workers_nice,
+            labelled=labelled,
+            labelled_share=labelled_share,
+            **shape,
+        )
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
     result = train(config)
     made = export_head(result.network, out, training=described(config, result))
     if card is not None:

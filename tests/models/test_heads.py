@@ -6,7 +6,7 @@ import yaml
 from warploom.errors import ModelError
 from warploom.models.card import DEFAULT_CARD, HeadCard
 from warploom.models.head import DetectionHead
-from warploom.models.heads import KINDS, card_kind, open_head, read_card
+from warploom.models.heads import KINDS, card_kind, check_head, open_head, read_card
 
 
 def test_the_shipped_head_opens_by_default():
@@ -42,3 +42,25 @@ def test_a_card_must_be_whole_whatever_its_kind(kind, tmp_path):
     path.write_text(yaml.safe_dump({"kind": kind, "name": "x"}))
     with pytest.raises(ModelError, match=r"the card is not valid: .*sha256: Field required"):
         open_head(path)
+
+
+@pytest.mark.real
+def test_a_cameras_head_is_no_head_for_points(shared_data, tmp_path):
+    from warploom.models.importers.image_detectors import import_yolox
+
+    card = import_yolox(shared_data / "weights" / "yolox_nano" / "yolox_nano.onnx", tmp_path)
+    check_head(card)
+    with pytest.raises(ModelError, match="kind yolox is for images"):
+        open_head(card, capacity=10)
+
+
+def test_what_card_and_model_say_of_the_classes_is_checked_without_detecting(tmp_path):
+    content = yaml.safe_load(DEFAULT_CARD.read_text())
+    content["classes"][:2] = content["classes"][1::-1]
+    for file in DEFAULT_CARD.parent.glob("*.onnx"):
+        (tmp_path / file.name).symlink_to(file)
+    path = tmp_path / "card.yaml"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(ModelError, match="its classes are vehicle,pedestrian"):
+        check_head(path)
+    assert check_head(DEFAULT_CARD)[0].name == "pillar_center"

@@ -158,6 +158,13 @@ def small_head(tmp_path):
     return import_yolox(tmp_path / "m.onnx", tmp_path / "head", classes=("a", "b", "c"))
 
 
+def test_an_import_that_fails_leaves_the_one_before_as_it_was(small_head, tmp_path):
+    constant_model(tmp_path / "other.onnx", (1, 84, 9), np.zeros((84, 9)), size=64)
+    with pytest.raises(ModelError, match="not a yolox of 3 classes"):
+        import_yolox(tmp_path / "other.onnx", small_head.parent, classes=("a", "b", "c"))
+    ImageDetector(small_head)
+
+
 def test_what_is_no_image_is_refused(small_head):
     head = ImageDetector(small_head)
     for image in (np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)):
