@@ -57,6 +57,7 @@ class ZenohConfig(BaseModel):
     domain: str = Field("", pattern=r"^[^*$?#/]*$")
     """Hosts of one domain hear each other; by default the name of the node."""
     queue: int = Field(8, ge=1, le=1024)
-    """How many data may wait for a reader; the oldest is dropped, counted."""
+    """How many data may wait for the network at the writer, and for processing at a reader; the oldest is dropped,
+    counted."""
     history: bool = True
     """Whether a reader that comes later is given the newest datum."""

@@ -32,6 +32,7 @@ __all__ = ["ZenohExporter", "ZenohImporter", "ZenohSession"]
 _log = logging.getLogger(__name__)
 
 _LIFE = 16
+_ROOM_S = 1e-3
 
 
 class ZenohSession:
@@ -82,7 +83,12 @@ def _wall_offset(clock: Clock) -> int:
 
 
 class ZenohExporter:
-    """Sends one topic."""
+    """Sends one topic, in a thread of its own.
+
+    Zenoh's queue holds two messages, or fragments of one. What it has no room for it drops and tells nobody; or it
+    lets its caller wait, as the thread here does. Where its own queue is full, a commit waits for a millisecond, as of
+    a burst there is room again at once; then the oldest is dropped, and counted.
+    """
 
     def __init__(self, session: ZenohSession, window: Window[Any], order: OrderFile) -> None:
         """Begins to send.
@@ -92,18 +98,27 @@ class ZenohExporter:
             window: Of the topic.
             order: Says under which epochs others see those of the window.
         """
+        import zenoh
+
         self._window = window
         self._order = order
+        self._queue = session.config.queue
+        self._error = zenoh.ZError
         self._life = uuid.uuid4().bytes
         self._counts: Counter[str] = Counter()
-        self._lock = threading.Lock()
+        self._waiting: deque[Event] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
         self._number = 0
         self._newest = b""
         key = session.key(window.topic)
-        self._publisher = session.session.declare_publisher(key, express=True)
+        block = zenoh.CongestionControl.BLOCK
+        self._publisher = session.session.declare_publisher(key, express=True, congestion_control=block)
         # A reader that comes later asks for the newest, when it sees the sign of life.
         self._queryable = session.session.declare_queryable(key, self._answer) if session.config.history else None
         self._sign = session.session.liveliness().declare_token(f"{key}/{self._life.hex()}")
+        self._thread = threading.Thread(target=self._run, name=f"export {window.topic}", daemon=True)
+        self._thread.start()
         self._unsubscribe = window.subscribe(self._on_commit, self._on_settle)
 
     def _on_commit(self, entry: Entry) -> None:
@@ -115,28 +130,51 @@ class ZenohExporter:
                 _log.warning("%s: version %d is not sent: %s", self._window.topic, entry.version, error)
             self._counts["not_encodable"] += 1
             self._window.losses.count(self._window.topic, "link_not_encodable", entry.version)
-            with self._lock:
+            with self._changed:
                 self._number += 1
             return
         wall = _wall_offset(self._window.clock)
         stamps = entry.received_ns + wall, entry.committed_ns + wall
         epoch = self._order.epoch(entry.epoch, entry.version)
-        self._send(Event(COMMIT, 0, epoch, entry.version, *stamps, entry.triggers, newest, body=body))
+        self._offer(Event(COMMIT, 0, epoch, entry.version, *stamps, entry.triggers, newest, body=body))
         self._counts["copied"] += 1
         self._counts["copied_bytes"] += len(body)
 
     def _on_settle(self, version: int, epoch: int) -> None:
         seen = self._order.settled(epoch, version)
         if seen is not None:
-            self._send(Event(SETTLE, 0, seen, version, 0, 0))
+            self._offer(Event(SETTLE, 0, seen, version, 0, 0))
 
-    def _send(self, event: Event) -> None:
-        with self._lock:
+    def _offer(self, event: Event) -> None:
+        with self._changed:
+            if not self._changed.wait_for(lambda: len(self._waiting) < self._queue, _ROOM_S):
+                self._lose(self._waiting.popleft())
             self._number += 1
-            data = self._life + pack_event(event._replace(number=self._number))
+            self._waiting.append(event._replace(number=self._number))
+            self._changed.notify()
+
+    def _lose(self, event: Event) -> None:
+        """Of what is not sent; its reader notices by the number that is missing."""
+        self._counts["slow"] += 1
+        self._window.losses.count(self._window.topic, "link_slow", event.version)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._stopping)
+                if not self._waiting:
+                    return
+                event = self._waiting.popleft()
+                self._changed.notify()
+            data = self._life + pack_event(event)
+            try:
+                self._publisher.put(data)
+            except self._error as error:  # the session has ended, or has no link left
+                _log.error("%s: version %d is not sent: %s", self._window.topic, event.version, error)
+                self._lose(event)
+                continue
             if event.kind == COMMIT and event.newest:
-                self._newest = data
-            self._publisher.put(data)
+                self._newest = data  # not before: a reader drops what comes after it with a lower number
             self._counts["sent"] += 1
             self._counts["sent_bytes"] += len(data)
 
@@ -150,8 +188,15 @@ class ZenohExporter:
         return {**self._counts, "remote_readers": int(self._publisher.matching_status.matching)}
 
     def stop(self) -> None:
-        """Ends sending."""
+        """Ends sending, after what waits has been sent, for which it takes five seconds at most."""
         self._unsubscribe()
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self._thread.join(5.0)
+        with self._changed:
+            while self._waiting:
+                self._lose(self._waiting.popleft())
         for one in (self._sign, self._queryable, self._publisher):
             if one is not None:
                 one.undeclare()

@@ -10,6 +10,7 @@ import pytest
 
 from warploom.datamesh import CommitPolicy, Miss, Outcome
 from warploom.datamesh.transport import ZenohConfig
+from warploom.datamesh.transport.wire import read_event
 from warploom.datamesh.transport.zenoh_links import ZenohSession
 from warploom.errors import ConfigError
 
@@ -153,7 +154,7 @@ def test_a_reader_that_hangs_loses_the_oldest_and_they_are_counted(hosts):
         assert hangs.wait(30)
         for version in range(2, 21):
             writer.commit("topic", version, version)
-            # One by one: in a burst zenoh itself drops at the sender what its queue has no room for.
+            writer.until(lambda counts, sent=version: counts["sent"] == sent, "topic")  # else its queue drops some
             reader.until(lambda counts, slow=version - 4: counts.get("slow", 0) >= slow, "topic")
         assert reader.counts("topic")["slow"] == 16
     finally:
@@ -161,6 +162,58 @@ def test_a_reader_that_hangs_loses_the_oldest_and_they_are_counted(hosts):
     assert received(reader, 4).versions == (1, 18, 19, 20)
     assert reader.counts("topic")["missed"] == 16
     assert reader.mesh.losses["topic", "link_missed"] == 16
+
+
+def test_while_a_link_stands_still_commits_go_on_and_what_is_dropped_is_counted(side, endpoint):
+    """A host that takes nothing more holds the link up; zenoh by itself would drop what comes, and tell nobody."""
+    here, there = config(listen=(endpoint,), domain="car", queue=4), config(connect=(endpoint,), domain="car", queue=99)
+    stands, go_on, read = threading.Event(), threading.Event(), []
+
+    def hold(sample):
+        stands.set()
+        go_on.wait(30)
+        read.append(sample.payload.to_bytes())
+
+    def numbers():
+        return [read_event(data[16:], 0).number for data in read]
+
+    writer = side("writer", of="here", exports=["topic"], remote=REMOTE, zenoh=here)
+    session = ZenohSession(there, node="there")
+    subscriber = session.session.declare_subscriber(session.key("topic"), hold)
+    try:
+        writer.until(lambda counts: counts["remote_readers"] == 1, "topic")
+        writer.commit("topic", 1, "first")
+        assert stands.wait(30)
+        for version in range(2, 42):
+            writer.commit("topic", version, np.zeros(4 << 20, np.uint8))  # 160 MB: more than sockets hold
+        slow = writer.counts("topic")["slow"]
+        assert 0 < slow < 40
+        assert writer.mesh.losses["topic", "link_slow"] == slow
+        go_on.set()
+        writer.wait(lambda: numbers()[-1:] == [41], numbers)
+        assert writer.counts("topic") == {**writer.counts("topic"), "sent": 41 - slow, "slow": slow}
+        assert len(numbers()) == 41 - slow
+        assert numbers() == sorted(set(numbers()))
+    finally:
+        go_on.set()
+        subscriber.undeclare()
+        session.close()
+
+
+def test_what_waits_is_sent_before_the_writer_ends(side, endpoint):
+    writer = side("writer", of="here", exports=["topic"], remote=REMOTE, zenoh=config(listen=(endpoint,), domain="car"))
+    reader = side(
+        "reader",
+        of="there",
+        imports=["topic"],
+        remote=REMOTE,
+        zenoh=config(connect=(endpoint,), domain="car", history=False),
+    )
+    writer.until(lambda counts: counts["remote_readers"] == 1, "topic")
+    for version in range(1, 7):
+        writer.commit("topic", version, np.zeros(1 << 20, np.uint8))
+    writer.links.stop()
+    assert received(reader, 6).versions == (1, 2, 3, 4, 5, 6)
 
 
 def test_a_payload_that_no_message_can_hold_is_counted(hosts):
