@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import SourceError
+from ...errors import ConfigError, SourceError
 from ...models.classes import UNKNOWN
 from ...models.detections import Detections
 from ...models.geometry import points_in_boxes
@@ -85,9 +85,14 @@ class DetectionEvaluation:
 def _read_detections(folder: pathlib.Path, frame: EvaluationFrame) -> Detections:
     """KITTI result files as detections."""
     if frame.kitti is None:
-        raise SourceError(f"{folder}: result files are of KITTI's sets; {frame.name} is of another")
+        raise ConfigError(f"{folder}: result files are of KITTI's sets; {frame.name} is of another")
     path = folder / f"{frame.name.rpartition('/')[2]}.txt"
-    boxes, scores, types = read_results(path, frame.kitti.calibration)
+    if not path.is_file():
+        raise ConfigError(f"{path}: not there; each scan has a result file, an empty one where nothing was found")
+    try:
+        boxes, scores, types = read_results(path, frame.kitti.calibration)
+    except SourceError as error:
+        raise ConfigError(str(error)) from None
     return Detections(
         boxes=boxes.astype(np.float32),
         scores=scores.astype(np.float32),
@@ -115,8 +120,8 @@ def evaluate_detection(
         review: Of false vehicles that are real though unlabelled.
 
     Raises:
-        ConfigError: A URI that makes no sense.
-        SourceError: Data that are missing or damaged.
+        ConfigError: A URI that makes no sense, no such data, or result files that are missing or damaged.
+        SourceError: Data that are damaged.
         ValueError: A folder of results without a score.
     """
     if not isinstance(head, pathlib.Path):
@@ -130,6 +135,9 @@ def evaluate_detection(
         head.warm_up()
     elif score is None:
         raise ValueError("score must be given where detections are read from files")
+    elif not head.is_dir():
+        what = "is no folder" if head.exists() else "is not there"
+        raise ConfigError(f"{head} {what}; expected one of KITTI's result files, 000000.txt for scan 000000 and so on")
     else:
         said = {"name": str(head)}
     outcomes, dropped = [], 0
@@ -143,7 +151,7 @@ def evaluate_detection(
                 found = _read_detections(head, frame)
             outcomes.append(judge(frame, found, time.perf_counter() - began, score, review))
     if not outcomes:
-        raise SourceError(f"{', '.join(data) or 'no data'}: no frames to evaluate")
+        raise ConfigError(f"{', '.join(data) or 'no data'}: no frames to evaluate")
     sets = {
         kind: figures_of(kind, [each for each in outcomes if each.frame.kind == kind], score, also, review)
         for kind in dict.fromkeys(each.frame.kind for each in outcomes)

@@ -11,6 +11,7 @@ above the ground [m].
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 import urllib.parse
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ import numpy as np
 from ...errors import ConfigError, SourceError
 from ...models.classes import BARRIER, CONE, CYCLIST, PEDESTRIAN, UNKNOWN, VEHICLE
 from ...models.geometry import wrap_angle
+from ...models.simulator import LIDARS, lidar_model
 from ..sources.kitti_labels import KITTI_CLASSES
 from ..sources.scan_files import read_scan
 from .kitti_objects import KittiLabels, label_files, unpack_scan
@@ -99,8 +101,8 @@ def evaluation_frames(uri: str) -> Iterator[EvaluationFrame]:
     """The frames of one data set.
 
     Raises:
-        ConfigError: No such kind or key, or a value that is not of its type.
-        SourceError: Nothing there, or a damaged file; raised while iterating too.
+        ConfigError: No such kind or key, a value that is not of its type, or no such data there; while iterating too.
+        SourceError: A damaged file, while iterating.
     """
     kind, colon, rest = uri.partition(":")
     if not colon or kind not in KINDS:
@@ -128,7 +130,14 @@ class _Keys:
         try:
             return kind(self._keys[name])
         except ValueError:
-            raise ConfigError(f"{self._uri}: {name} is {self._keys[name]!r}, which is no {kind.__name__}") from None
+            raise ConfigError(f"{self._uri}: {name} is {self._keys[name]!r}; expected {_EXPECTED[kind]}") from None
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError
+    return value
 
 
 def _every(text: str) -> int:
@@ -138,10 +147,40 @@ def _every(text: str) -> int:
     return step
 
 
+def _seeds(text: str) -> range:
+    first, _, last = text.partition("-")
+    seeds = range(int(first), int(last or first) + 1)
+    if not seeds or seeds.start < 0:
+        raise ValueError
+    return seeds
+
+
+_EXPECTED: dict[Callable, str] = {
+    int: "a whole number",
+    _number: "a number",
+    _every: "a whole number from 1 on: each so manieth scan",
+    _seeds: "a seed, or the first and the last of several, such as 500-529",
+    lidar_model: f"one of {', '.join(LIDARS)}",
+}
+
+
+def _folder(uri: str, place: str, holds: str) -> pathlib.Path:
+    """The folder that a URI names.
+
+    Raises:
+        ConfigError: There is none; the message says what it should hold.
+    """
+    root = pathlib.Path(place).expanduser()
+    if not root.is_dir():
+        what = "is no folder" if root.exists() else "is not there"
+        raise ConfigError(f"{uri}: {root} {what}; expected a folder with {holds}")
+    return root
+
+
 def _kitti(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFrame]:
     options = _Keys(uri, keys, ("sequence", "every", "height"))
-    root = pathlib.Path(place).expanduser()
-    height, step = options.get("height", float, _KITTI_HEIGHT), options.get("every", _every, 1)
+    root = _folder(uri, place, "velodyne/ and label_2/ or label_02/, as KITTI's sets have them")
+    height, step = options.get("height", _number, _KITTI_HEIGHT), options.get("every", _every, 1)
     for path, labels, image in label_files(root, options.get("sequence", str, None))[::step]:
         points = unpack_scan(path) if path.suffix == ".npz" else read_scan(path).points
         found = labels()
@@ -178,13 +217,13 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
     if place == "scenes":
         options = _Keys(uri, keys, ("seeds", "lidar", "height"))
         seeds = options.get("seeds", _seeds, range(500, 530))
-        lidar = options.get("lidar", str, None)
+        lidar = options.get("lidar", lidar_model, None)
         if seeds.stop > _HELD_OUT:
             raise ConfigError(f"{uri}: seeds from {_HELD_OUT} on are trained on; take lower ones")
         named = ((f"scene {seed}", sample_scene(seed, lidar=lidar, visibility=True)) for seed in seeds)
     else:
         options = _Keys(uri, keys, ("seed", "lidar", "duration", "rate", "every", "height", "mounting_height"))
-        given = {"seed": int, "lidar": str, "duration": float, "rate": float, "mounting_height": float}
+        given = {"seed": int, "lidar": lidar_model, "duration": _number, "rate": _number, "mounting_height": _number}
         arguments = {name: options.get(name, kind, None) for name, kind in given.items() if name in keys}
         try:
             drive = Simulator(scenario=place, turning=False, visibility=True, **arguments)
@@ -192,7 +231,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
             raise ConfigError(f"{uri}: {error}") from None
         steps = range(0, len(drive), options.get("every", _every, 1))
         named = ((f"{place} {drive.seed}, frame {index}", drive.frame(index)) for index in steps)
-    height = options.get("height", float, None)
+    height = options.get("height", _number, None)
     for name, frame in named:
         yield EvaluationFrame(
             name=name,
@@ -208,19 +247,13 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
         )
 
 
-def _seeds(text: str) -> range:
-    first, _, last = text.partition("-")
-    seeds = range(int(first), int(last or first) + 1)
-    if not seeds or seeds.start < 0:
-        raise ValueError
-    return seeds
-
-
 def _nuscenes(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFrame]:
     options = _Keys(uri, keys, ("height", "info"))
-    root = pathlib.Path(place).expanduser()
+    root = _folder(uri, place, "key frames of nuScenes and their info.json, as mmdetection3d writes it")
     path = root / options.get("info", str, "info.json")
-    height = options.get("height", float, _NUSCENES_HEIGHT)
+    if not path.is_file():
+        raise ConfigError(f"{uri}: {path} is not there; name mmdetection3d's info file with ?info=NAME")
+    height = options.get("height", _number, _NUSCENES_HEIGHT)
     try:
         content = json.loads(path.read_text())
         names = {number: name for name, number in content["metainfo"]["categories"].items()}
@@ -261,10 +294,10 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
     if name not in _RANGE_LABELS:
         raise ConfigError(f"{uri}: labels must be one of {', '.join(_RANGE_LABELS)}, not {name!r}")
     cars, vehicles, nothing, usual = _RANGE_LABELS[name]
-    root = pathlib.Path(place).expanduser()
+    root = _folder(uri, place, "range images (.npz)")
     paths = sorted(root.glob("*.npz"))
     if not paths:
-        raise SourceError(f"{root}: no range images (.npz) there")
+        raise ConfigError(f"{uri}: no range images (.npz) in {root}")
     for path in paths:
         try:
             with np.load(path, allow_pickle=False) as image:
@@ -276,7 +309,7 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
             name=f"{root.name}/{path.stem}",
             kind="range",
             points=points,
-            sensor_height=options.get("height", float, usual),
+            sensor_height=options.get("height", _number, usual),
             boxes=np.empty((0, 7)),
             classes=np.empty(0, np.int32),
             types=(),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import SourceError
+from ...errors import ConfigError, SourceError
 from ...models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ...models.evaluation.kitti_ap import KittiDetections, KittiTruth
 from ...models.geometry import KittiCalibration, box_corners, points_in_boxes
@@ -163,7 +163,7 @@ def label_files(root: pathlib.Path, sequence: str | None = None) -> list[Labelle
     Of an object set, scans without labels and labels without a scan are left out, and the log says how many.
 
     Raises:
-        SourceError: There are none, or a sequence must be named.
+        ConfigError: It is no folder of KITTI's, or a sequence must be named.
     """
     if (root / "label_2").is_dir():
         scans = _scans(root)
@@ -174,7 +174,9 @@ def label_files(root: pathlib.Path, sequence: str | None = None) -> list[Labelle
             if labels.is_file()
         ]
         if not found:
-            raise SourceError(f"{root}: no scan in velodyne/ has labels in label_2/")
+            raise ConfigError(
+                f"{root}: no scan in velodyne/ (.bin) has labels in label_2/ (.txt) under the same number"
+            )
         labelled, scanned = {path.stem for path in (root / "label_2").glob("*.txt")}, {path.stem for path in scans}
         for names, what in (
             (scanned - labelled, "scans without labels"),
@@ -184,11 +186,16 @@ def label_files(root: pathlib.Path, sequence: str | None = None) -> list[Labelle
                 _log.warning("%s: %d %s are left out, such as %s", root, len(names), what, min(names))
         return found
     names = labelled_sequences(root)
+    if not names:
+        raise ConfigError(
+            f"{root}: no KITTI set with labels: neither label_2/ beside velodyne/, as of the object set, nor "
+            "label_02/SEQUENCE.txt beside velodyne/SEQUENCE/, as of the tracking set"
+        )
     if sequence is None and len(names) == 1:
         sequence = names[0]
     if sequence not in names:
-        there = ", ".join(names) or "none"
-        raise SourceError(f"{root}: no labelled sequence {sequence or 'named'}; there are: {there}; add ?sequence=NAME")
+        what = "no sequence named" if sequence is None else f"no labelled sequence {sequence}"
+        raise ConfigError(f"{root}: {what}; there are: {', '.join(names)}; add ?sequence=NAME")
     calibration = root / "calib" / f"{sequence}.txt"
     return [
         (

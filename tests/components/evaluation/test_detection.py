@@ -135,27 +135,74 @@ def test_what_has_no_counterpart_is_told(kitti, caplog):
 
 
 @pytest.mark.parametrize(
-    ("uri", "error", "message"),
+    ("uri", "message"),
     [
-        ("kitti", ConfigError, "expected one of kitti:"),
-        ("lyft:x", ConfigError, "expected one of kitti:"),
-        ("kitti:", ConfigError, "nothing after kitti:"),
-        ("kitti:/nowhere?speed=3", ConfigError, "unknown key 'speed'"),
-        ("kitti:/nowhere?every=0", ConfigError, "every is '0'"),
-        ("kitti:/nowhere", SourceError, "no labelled sequence"),
-        ("sim:scenes?seeds=9-3", ConfigError, "seeds is '9-3'"),
-        ("sim:scenes?seeds=1000000-1000001", ConfigError, "are trained on"),
-        ("sim:mars", ConfigError, "scenario must be one of"),
-        ("sim:street?seeds=9-3", ConfigError, "holds no seed"),
-        ("sim:street?seeds=9", ConfigError, "seeds is '9'; write it as"),
-        ("nuscenes:/nowhere", SourceError, "No such file"),
-        ("range:/nowhere", SourceError, "no range images"),
-        ("range:/nowhere?labels=x", ConfigError, "labels must be one of"),
+        ("kitti", "expected one of kitti:"),
+        ("lyft:x", "expected one of kitti:"),
+        ("kitti:", "nothing after kitti:"),
+        ("kitti:/nowhere?speed=3", "unknown key 'speed'"),
+        ("kitti:.?every=0", "every is '0'; expected a whole number from 1 on"),
+        ("kitti:.?height=inf", "height is 'inf'; expected a number"),
+        ("kitti:/nowhere", "/nowhere is not there; expected a folder with velodyne/ and label_2/ or label_02/"),
+        ("kitti:some.txt", "some.txt is no folder; expected"),
+        ("kitti:.", "no KITTI set with labels: neither label_2/ beside velodyne/"),
+        ("sim:scenes?seeds=9-3", "seeds is '9-3'; expected a seed, or the first and the last of several"),
+        ("sim:scenes?seeds=x", "seeds is 'x'; expected a seed"),
+        ("sim:scenes?seeds=1000000-1000001", "are trained on"),
+        ("sim:scenes?seeds=1&lidar=hdl65", "lidar is 'hdl65'; expected one of vlp16, hdl32"),
+        ("sim:mars", "scenario must be one of"),
+        ("sim:street?seed=x", "seed is 'x'; expected a whole number"),
+        ("sim:street?every=x", "every is 'x'; expected a whole number from 1 on"),
+        ("sim:street?seeds=9-3", "holds no seed"),
+        ("sim:street?seeds=9", "seeds is '9'; write it as"),
+        ("nuscenes:/nowhere", "/nowhere is not there; expected a folder with key frames of nuScenes"),
+        ("nuscenes:.", "info.json is not there"),
+        ("range:/nowhere", "/nowhere is not there; expected a folder with range images"),
+        ("range:.", "no range images"),
+        ("range:/nowhere?labels=x", "labels must be one of"),
     ],
 )
-def test_what_makes_no_sense_is_said(uri, error, message):
-    with pytest.raises(error, match=message):
+def test_what_makes_no_sense_is_said(uri, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "some.txt").write_text("")
+    with pytest.raises(ConfigError, match=message) as refused:
         list(evaluation_frames(uri))
+    assert " _" not in str(refused.value), "no name of our own code"
+
+
+def test_a_set_without_scans_or_sequences_says_what_is_missing(kitti):
+    (kitti / "label_2").rename(kitti / "label_02")
+    (kitti / "label_02" / "0001.txt").write_text("")
+    (kitti / "velodyne" / "0001").mkdir()
+    (kitti / "velodyne" / "000001.bin").rename(kitti / "velodyne" / "0001" / "000000.bin")
+    with pytest.raises(ConfigError, match=r"no labelled sequence 7; there are: 0001; add \?sequence=NAME"):
+        list(evaluation_frames(f"kitti:{kitti}?sequence=7"))
+    (kitti / "label_2").mkdir()
+    with pytest.raises(ConfigError, match=r"no scan in velodyne/ \(\.bin\) has labels in label_2/"):
+        list(evaluation_frames(f"kitti:{kitti}"))
+
+
+@pytest.mark.parametrize(
+    ("results", "message"),
+    [
+        ("nowhere", "nowhere is not there; expected one of KITTI's result files"),
+        ("label_2/000001.txt", "000001.txt is no folder; expected one of KITTI's result files"),
+        ("calib/..", "000001.txt: not there; each scan has a result file"),
+        ("label_2", "000001.txt, line 1: not a KITTI label"),
+    ],
+)
+def test_results_that_cannot_be_scored_end_as_bad_usage(kitti, warploom, results, message):
+    said = warploom("eval", "detection", "--data", f"kitti:{kitti}", "--detections", kitti / results, "--score", 0.5,
+                    expect=2)  # fmt: skip
+    assert message in said
+
+
+def test_data_that_are_not_there_end_as_bad_usage(kitti, warploom):
+    for data in ("kitti:/nowhere", f"kitti:{kitti}/calib"):
+        said = warploom(
+            "eval", "detection", "--data", data, "--detections", kitti / "results", "--score", 0.5, expect=2
+        )
+        assert data[6:] in said
 
 
 def test_simulated_scenes_come_with_their_truth():
