@@ -158,11 +158,11 @@ class Snapshot(Generic[T]):
             return None
         if version in state.settled:
             return Miss.SETTLED_EMPTY
+        if state.versions and version > state.versions[-1]:
+            return Miss.FUTURE  # also where higher ones were evicted, before versions were overwritten
         if version <= state.evicted:
             return Miss.EVICTED
-        if not state.versions or version > state.versions[-1]:
-            return Miss.FUTURE
-        return Miss.NEVER
+        return Miss.NEVER if state.versions else Miss.FUTURE
 
     def last(self) -> T:
         """The newest datum, which need not be that of the trigger: read frame data by its version.

@@ -54,6 +54,7 @@ class Waiting(Generic[T]):
             return Outcome.FOUND, snapshot.entry(index)
         if self.version in of_epoch.settled:
             return Outcome.SETTLED_EMPTY, None
-        if self.version + self.tolerance_ns <= of_epoch.evicted or of_epoch.epoch < state.epoch:
+        reach, newest = self.version + self.tolerance_ns, of_epoch.versions[-1] if of_epoch.versions else -1
+        if reach <= min(of_epoch.evicted, newest) or of_epoch.epoch < state.epoch:
             return Outcome.EVICTED, None
         return None

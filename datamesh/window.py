@@ -213,8 +213,10 @@ class Window(Generic[T]):
             ):  # the usual case, without a call
                 freeze(entry[1])
                 if len(versions) >= self.capacity:
-                    evicted, previous = versions[0], None
-                    gone.append(evicted)
+                    first, previous = versions[0], None
+                    gone.append(first)
+                    if first > evicted:  # it is lower where versions were overwritten
+                        evicted = first
                     versions, entries = versions[1:], entries[1:]
                 versions, entries = versions + (version,), entries + (entry,)  # noqa: RUF005  in half the time
                 self.state = _new_state((epoch, versions, entries, evicted, settled, gone, previous))
@@ -285,9 +287,8 @@ class Window(Generic[T]):
         version, evicted, previous = entry.version, state.evicted, state.previous
         first = 1 if len(state.versions) >= self.capacity else 0
         if first:
-            evicted = state.versions[0]
-            state.gone.append(evicted)
-            previous = None
+            state.gone.append(state.versions[0])
+            evicted, previous = max(evicted, state.versions[0]), None
         versions = (*state.versions[first:index], version, *state.versions[index:])
         entries = (*state.entries[first:index], entry, *state.entries[index:])
         settled = state.settled

@@ -14,6 +14,7 @@ from warploom.datamesh import (
     LossCounters,
     ManualClock,
     Miss,
+    Outcome,
     Output,
     Reorder,
     Status,
@@ -125,6 +126,31 @@ def test_who_watches_losses_may_read_and_write_the_window_that_lost():
     window.commit(DISCARD, entry(15), REPLACE)
     assert seen == [("out_of_order", 5), ("overwritten", 20), ("replaced", 15)]
     assert window.snapshot().miss(1005) is Miss.SETTLED_EMPTY
+
+
+def test_what_was_evicted_before_versions_were_overwritten_is_not_settled():
+    """The version evicted last is then lower than one evicted before."""
+    window = Window("topic", 3)
+    for version in (1, 4, 5, 6):
+        window.commit(DISCARD, entry(version))
+    window.commit(OVERWRITE, entry(2))
+    for version in (3, 0, 4):
+        window.commit(INSERT, entry(version))
+    assert window.snapshot().versions == (2, 3, 4)
+    window.settle(1)
+    assert window.snapshot().miss(1) is Miss.EVICTED
+
+
+def test_what_is_above_an_overwriting_version_is_to_come_and_waited_for():
+    window, outcomes = Window("topic", 3), []
+    for version in (1, 4, 5, 6, 7):
+        window.commit(DISCARD, entry(version))
+    window.commit(OVERWRITE, entry(2))
+    assert window.snapshot().miss(3) is Miss.FUTURE
+    window.wait(3, lambda wait: outcomes.append((wait.outcome, wait.entry.version)))
+    assert outcomes == []
+    window.commit(DISCARD, entry(3))
+    assert outcomes == [(Outcome.FOUND, 3)]
 
 
 class Reordering:
@@ -333,6 +359,8 @@ class StateMachine(RuleBasedStateMachine):
             assert snapshot.before(version) == sum(v < version for v in self.model) - 1
             assert (snapshot.miss(version) is None) == (version in self.model)
             assert (snapshot.miss(version) is Miss.SETTLED_EMPTY) == (version in self.settled)
+            to_come = version > max(self.model, default=-1) and version not in self.settled
+            assert (snapshot.miss(version) is Miss.FUTURE) == to_come
 
     @invariant()
     def told_and_counted_everything(self):
