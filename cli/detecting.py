@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +17,31 @@ from .options import Device, Profile
 __all__ = ["commands"]
 
 commands = typer.Typer()
+
+_CARD_HELP = "A head's card, or the name of one that ships: pillar_center, pillar_center_int8"
+
+
+@contextlib.contextmanager
+def _torch_to(purpose: str) -> Iterator[None]:
+    """Says what to install where a library of the extra `torch` is missing."""
+    from ..errors import ConfigError
+
+    try:
+        yield
+    except ImportError as error:
+        raise ConfigError(
+            f"to {purpose} takes {error.name or 'torch'}, which is not installed: pip install 'warploom[torch]'"
+        ) from error
+
+
+def _make_folder(out: Path) -> None:
+    """Makes the folder for the outputs, before hours of work end without a place to go."""
+    from ..errors import SinkError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SinkError(f"{out}: the folder cannot be made: {error.strerror or error}") from error
 
 
 @evaluation.command("detection")
@@ -30,7 +57,7 @@ def eval_detection(
     ],
     profile: Profile = "cpu",
     device: Device = None,
-    head: Annotated[Path | None, typer.Option("--head", help="A head's card, in place of the profile's.")] = None,
+    head: Annotated[Path | None, typer.Option("--head", help=f"{_CARD_HELP}; in place of the profile's.")] = None,
     detections: Annotated[
         Path | None, typer.Option("--detections", help="Score this folder of KITTI result files instead.")
     ] = None,
@@ -53,7 +80,11 @@ def eval_detection(
     from ..components.evaluation.detection_report import write_report
     from ..components.evaluation.detection_reviews import Review
 
+    for value in scores or ():
+        if not 0 <= value <= 1:
+            raise typer.BadParameter(f"must be from 0 to 1, not {value:g}", param_hint="--score")
     review = Review.read(reviewed) if reviewed is not None else None
+    _make_folder(out)
     if detections is None:
         from pydantic import ValidationError
 
@@ -118,34 +149,32 @@ def import_head(
     Example: `warploom head import pointpillars pointpillar_7728.pth --out heads`, then `models: {detector: …}` in a
     profile, or `warploom eval detection --head heads/pointpillars.yaml …`
     """
-    from ..errors import ConfigError
-
     if kind not in _IMPORTERS:
-        raise ConfigError(f"no importer {kind!r}; there are: {', '.join(_IMPORTERS)}")
+        raise typer.BadParameter(f"no importer {kind!r}; there are: {', '.join(_IMPORTERS)}", param_hint="KIND")
     if config is not None and kind != "pointpillars":
         raise typer.BadParameter("only pointpillars takes a configuration", param_hint="--config")
-    try:
+    _make_folder(out)
+    with _torch_to("import a head"):
         module = importlib.import_module(f"..models.importers.{_IMPORTERS[kind]}", __package__)
         importer = getattr(module, f"import_{kind}")
         if config is not None:
             importer = functools.partial(importer, spec=module.PointPillarsSpec.read_file(config))
         card = importer(checkpoint, out)
-    except ImportError as error:
-        needed = error.name or "torch"
-        raise ConfigError(
-            f"to import a head takes {needed}, which is not installed: pip install 'warploom[torch]'"
-        ) from error
     typer.echo(f"{card}")
 
 
-def _list_all(wanted: bool) -> None:
-    if not wanted:
-        return
+def _run_training(arguments: list[str]) -> None:
     from ..models.training.__main__ import main
 
     training = typer.Typer(add_completion=False)
     training.command()(main)
-    training(["--help"], prog_name="warploom head train")
+    training(arguments, prog_name="warploom head train", standalone_mode=False)
+
+
+def _list_all(wanted: bool) -> None:
+    if wanted:
+        _run_training(["--help"])
+        raise typer.Exit
 
 
 @heads.command("train", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
@@ -170,36 +199,25 @@ def train(
 ) -> None:
     """Train a head on simulated scenes, or go on with one on labelled scans of your own.
 
-    Example: `warploom head train --data kitti:my_drives --start-from pillar_center.yaml --frozen --learning-rate 3e-4
-    --frames 200 --minutes 20 --out my_head`; `models/weights/pillar_center.yaml` is the head that ships. All options of
+    Example: `warploom head train --data kitti:my_drives --start-from pillar_center --frozen --learning-rate 3e-4
+    --frames 200 --minutes 20 --out my_head` goes on with the head that ships. All options of
     `python -m warploom.models.training` may follow: `--all` lists them.
     """
-    from ..errors import ConfigError
-
-    try:
-        from ..models.training.__main__ import main
-    except ImportError as error:
-        needed = error.name or "torch"
-        raise ConfigError(f"to train takes {needed}, which is not installed: pip install 'warploom[torch]'") from error
-    training = typer.Typer(add_completion=False)
-    training.command()(main)
+    _make_folder(out)
     arguments = ["--out", str(out), *context.args]
-    if data:
-        from ..components.labelled_scans import write_labelled_scans
+    with _torch_to("train"):
+        if data:
+            from ..components.labelled_scans import write_labelled_scans
 
-        for uri in data:
-            typer.echo(f"{uri}: {write_labelled_scans(uri, out / 'labelled')} labelled scans")
-        arguments += ["--labelled", str(out / "labelled")]
-    try:
-        training(arguments, prog_name="warploom head train", standalone_mode=False)
-    except ImportError as error:
-        needed = error.name or "torch"
-        raise ConfigError(f"to train takes {needed}, which is not installed: pip install 'warploom[torch]'") from error
+            for uri in data:
+                typer.echo(f"{uri}: {write_labelled_scans(uri, out / 'labelled')} labelled scans")
+            arguments += ["--labelled", str(out / "labelled")]
+        _run_training(arguments)
 
 
 @heads.command("show")
 def show_head(
-    card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
+    card: Annotated[Path | None, typer.Argument(help=f"{_CARD_HELP}; by default the first.")] = None,
 ) -> None:
     """Check a card and its model, and tell what it says.
 
@@ -217,7 +235,7 @@ def show_head(
 
 @heads.command("quantize")
 def quantize(
-    card: Annotated[Path | None, typer.Argument(help="A head's card; without one, the head that ships.")] = None,
+    card: Annotated[Path | None, typer.Argument(help=f"{_CARD_HELP}; by default the first.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the ONNX file and the card.")] = Path("heads"),
     frames: Annotated[int, typer.Option(min=1, help="Simulated scenes to calibrate with.")] = 12,
 ) -> None:

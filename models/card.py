@@ -30,6 +30,8 @@ __all__ = [
     "default_card",
     "file_sha256",
     "load_card",
+    "named_card",
+    "read_card_file",
     "read_yaml",
     "save_card",
 ]
@@ -273,6 +275,12 @@ def default_card(device: str) -> Path:
     return EIGHT_BITS_CARD if device == "cpu" else DEFAULT_CARD
 
 
+def named_card(card: str | Path) -> Path:
+    """The path of a card: of a head that ships by its name, such as `pillar_center`, else what is given."""
+    ships = {name: path for path in (DEFAULT_CARD, EIGHT_BITS_CARD) for name in (path.stem, path.name)}
+    return Path(card) if Path(card).is_file() else ships.get(str(card), Path(card))
+
+
 def file_sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as file:
@@ -295,6 +303,23 @@ def read_yaml(text: str) -> Any:
         return yaml.safe_load(text)
 
 
+def read_card_file(path: Path) -> Any:
+    """What the YAML of a card says.
+
+    Raises:
+        ModelError: It cannot be read, or is no YAML.
+    """
+    try:
+        return read_yaml(path.read_text("utf-8"))
+    except OSError as error:
+        raise ModelError(
+            f"{path}: cannot read the head's card: {error.strerror}; by name there are {DEFAULT_CARD.stem} and "
+            f"{EIGHT_BITS_CARD.stem}"
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ModelError(f"{path}: the card is not YAML: {error}") from error
+
+
 @overload
 def load_card(path: str | Path) -> tuple[HeadCard, Path]: ...
 
@@ -307,7 +332,7 @@ def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[Model
     """Reads a card and checks that its model is there, is the one it means, and that card and model agree in shape.
 
     Args:
-        path: The YAML file.
+        path: The YAML file, or the name of a head that ships, see `named_card`.
         kind: What kind of card it must be.
 
     Returns:
@@ -316,15 +341,10 @@ def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[Model
     Raises:
         ModelError: The card is missing or not valid, or the model is missing or has another sha256 or opset.
     """
-    path = Path(path)
+    path = named_card(path)
+    content = read_card_file(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
-    try:
-        card = kind.model_validate(read_yaml(text))
-    except yaml.YAMLError as error:
-        raise ModelError(f"{path}: the card is not YAML: {error}") from error
+        card = kind.model_validate(content)
     except ValidationError as error:
         reasons = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'card'}: {e['msg']}" for e in error.errors())
         raise ModelError(f"{path}: the card is not valid: {reasons}") from error

@@ -81,7 +81,8 @@ class DetectionHead:
     """The network of one card, loaded and bound to its buffers.
 
     Args:
-        card: A head's card (YAML), its ONNX file beside it; None is the head that ships, see `default_card`.
+        card: A head's card (YAML), its ONNX file beside it, or the name of one that ships (`card.named_card`); None is
+            the one of these for the device, see `default_card`.
         device: A Warp device, such as `cpu` or `cuda:0`; the kernels run there, and the network too where ONNX
             Runtime has a provider for it, else on the CPU, which is logged and said by `provider` and `fallback`.
         threads: CPU threads of the network.

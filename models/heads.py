@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import warp as wp
-import yaml
 
 from ..errors import ModelError
-from .card import ModelCard, default_card, read_yaml
+from .card import ModelCard, default_card, load_card, named_card, read_card_file
 from .detections import Detections
 
 __all__ = ["KINDS", "LidarHead", "card_kind", "check_head", "open_head", "read_card"]
@@ -59,12 +58,7 @@ def card_kind(path: str | Path) -> str:
     Raises:
         ModelError: It cannot be read, or is of no known kind.
     """
-    try:
-        content = read_yaml(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise ModelError(f"{path}: cannot read the head's card: {error.strerror}") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ModelError(f"{path}: the card is not YAML: {error}") from error
+    content = read_card_file(named_card(path))
     kind = content.get("kind", "pillar_center") if isinstance(content, dict) else None
     if kind not in KINDS:
         raise ModelError(f"{path}: a card of the kind {kind!r}; there are: {', '.join(KINDS)}")
@@ -81,8 +75,6 @@ def read_card(path: str | Path) -> tuple[ModelCard, Path]:
     Raises:
         ModelError: The card or its model is missing, not valid, or the two do not fit.
     """
-    from .card import load_card
-
     _, _, module, name = KINDS[card_kind(path)]
     return load_card(path, _named(module, name))
 
@@ -103,7 +95,8 @@ def open_head(card: str | Path | None = None, **options: Any) -> Any:
     """The head of a LiDAR's card, of whatever kind.
 
     Args:
-        card: The YAML file; None is the head that ships with warploom.
+        card: The YAML file; the name of a head that ships with warploom, `pillar_center` or `pillar_center_int8`; None
+            is the one of these for the device.
         options: Of the head's class: device, threads, precision, providers, score_threshold, capacity.
 
     Raises:

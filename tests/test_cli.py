@@ -96,6 +96,17 @@ def test_frames_limits_the_run(warploom, scans, tmp_path):
         (["--log-level", "loud", "info"], 2, "none of debug"),
         (["head", "train", "--out", "x", "--minutes", "1", "--iterations", "2"], 2, "either minutes or iterations"),
         (["head", "train", "--all"], 0, "--learning-rate"),
+        (["head", "train", "--out", "x", "--start-from", "pillar", "--iterations", "2"], 2, "pillar is not there"),
+        (["head", "show", "pillar_center_int8"], 0, "name: pillar_center_int8"),
+        (["head", "import", "yolo", "x.onnx"], 2, "no importer 'yolo'; there are: pointpillars"),
+        (["eval", "detection", "--data", "sim:street", "--head", "pillar"], 2, "pillar: cannot read the head's card"),
+        (["eval", "detection", "--data", "sim:street", "--score", "0.3", "--score", "7"], 2, "from 0 to 1, not 7"),
+        (["eval", "detection", "--data", "sim:street", "--score", "nan"], 2, "from 0 to 1, not nan"),
+        (
+            ["eval", "detection", "--data", "sim:street", "--out", "/dev/null"],
+            1,
+            "/dev/null: the folder cannot be made",
+        ),
     ],
 )
 def test_bad_usage_says_what_and_ends_with_its_code(warploom, arguments, code, message):

@@ -30,7 +30,10 @@ def main(
     frames_folder: Annotated[Path | None, typer.Option(help="Where to keep them; found again next time.")] = None,
     start_from: Annotated[
         Path | None,
-        typer.Option(help="Begin with the weights of this checkpoint, or of a head's card, whose network it then is."),
+        typer.Option(
+            help="Begin with the weights of this checkpoint, or of a head's card, whose network it then is; "
+            "pillar_center is the head that ships."
+        ),
     ] = None,
     labelled: Annotated[
         Path | None, typer.Option(help="Learn from the scans of this folder too: `warploom head train` writes them.")
@@ -55,6 +58,7 @@ def main(
 ) -> None:
     """Trains a pillar centre head on simulated scenes, and on labelled scans; interrupted, the same command goes on."""
     from ...kernels.pillar import pillar_channels
+    from ..card import DEFAULT_CARD, named_card
     from .export import CARDS, export_head, exported_shape, like
     from .loop import TrainingConfig, described, train
     from .network import LEAN_CHANNELS
@@ -68,6 +72,14 @@ def main(
         "channels": LEAN_CHANNELS if lean else pillar_channels(),
         "extras": tuple(extra or ()),
     }
+    if start_from is not None:
+        start_from = named_card(start_from)
+        if not start_from.is_file():
+            raise typer.BadParameter(
+                f"{start_from} is not there; expected a checkpoint.pt or a card, or {DEFAULT_CARD.stem}, the head that "
+                "ships",
+                param_hint="--start-from",
+            )
     card = start_from if start_from is not None and start_from.suffix in CARDS else None
     if card is not None:
         shape = exported_shape(card)

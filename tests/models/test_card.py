@@ -1,12 +1,14 @@
 """Cards: read back as written, and a model that does not fit is refused by name."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 import yaml
 
 from warploom.errors import ModelError
-from warploom.models.card import DEFAULT_CARD, EIGHT_BITS_CARD, default_card, load_card, save_card
+from warploom.models.card import DEFAULT_CARD, EIGHT_BITS_CARD, default_card, load_card, named_card, save_card
 from warploom.models.head import DetectionHead
 from warploom.models.training.export import export_head
 from warploom.models.training.network import PillarCenterNet
@@ -166,3 +168,14 @@ def test_a_cpu_gets_the_head_in_eight_bits_and_a_gpu_in_floating_point():
         whole.classes,
     )
     assert DetectionHead(threads=1).card == small
+
+
+def test_a_head_that_ships_is_found_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert named_card("pillar_center") == named_card("pillar_center.yaml") == DEFAULT_CARD
+    assert load_card("pillar_center_int8")[0].name == "pillar_center_int8"
+    assert named_card("my_head/pillar_center.yaml") == Path("my_head/pillar_center.yaml"), "a path is a path"
+    (tmp_path / "pillar_center.yaml").write_text("name: mine")
+    assert named_card("pillar_center.yaml") == Path("pillar_center.yaml"), "and a file goes first"
+    with pytest.raises(ModelError, match=r"pillar: cannot read .*; by name there are pillar_center and pillar_center_"):
+        load_card("pillar")
