@@ -15,7 +15,7 @@ from typing import Annotated
 import torch
 import typer
 
-from .loop import averaged_weights
+from .loop import averaged_weights, read_checkpoint
 from .network import PillarCenterNet
 
 __all__ = ["average_networks"]
@@ -40,7 +40,7 @@ def average_networks(
         raise ValueError(f"shares must be {len(checkpoints)} positive numbers, one a checkpoint, not {list(shares)}")
     weights = torch.tensor(shares or [1.0] * len(checkpoints), dtype=torch.float64)
     weights /= weights.sum()
-    states = [averaged_weights(torch.load(path, weights_only=True)) for path in checkpoints]
+    states = [averaged_weights(read_checkpoint(path)) for path in checkpoints]
     mean = {
         name: torch.tensordot(weights, torch.stack([state[name].double() for state in states]), 1).to(first.dtype)
         if first.is_floating_point()

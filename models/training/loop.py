@@ -17,6 +17,7 @@ import torch
 import warp as wp
 from torch.utils.data import DataLoader, IterableDataset
 
+from ...errors import ModelError
 from ...kernels.pillar import PillarGrid, pillar_channels
 from .bowing import bowed
 from .export import CARDS, exported_weights
@@ -34,7 +35,7 @@ from .network import STRIDE, PillarCenterNet
 from .targets import draw_targets, loss
 from .windows import Window, Windows, window_of
 
-__all__ = ["TrainingConfig", "TrainingResult", "make_frames", "train"]
+__all__ = ["TrainingConfig", "TrainingResult", "make_frames", "read_checkpoint", "train"]
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +89,8 @@ class TrainingConfig:
     """Processes that make frames."""
     workers_nice: int = 10
     """How far those stand back for other processes."""
+    save_every: float = 120.0
+    """Time between two checkpoints [s]: what a training that is killed does again at most."""
     augmentation: Augmentation = field(default_factory=Augmentation)
     start_from: Path | None = None
     """Checkpoint of another training, or card of a head in floating point, whose weights this one begins with, on a
@@ -270,6 +273,24 @@ def _running_average(decay: float) -> Callable[[torch.Tensor, torch.Tensor, int]
     return average
 
 
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """What a training has saved.
+
+    Raises:
+        ModelError: It cannot be read, or is of something else.
+    """
+    try:
+        state = torch.load(path, weights_only=True)
+    except OSError as error:
+        raise ModelError(f"{path}: cannot read the checkpoint: {error.strerror or error}") from error
+    except Exception as error:  # pickle, zip and torch each have errors of their own
+        reason = str(error).partition("\n")[0]
+        raise ModelError(f"{path}: the checkpoint is damaged, or none of a training: {reason}") from error
+    if not isinstance(state, dict) or "averaged" not in state:
+        raise ModelError(f"{path}: not a checkpoint of a training; expected the checkpoint.pt that one left")
+    return state
+
+
 def averaged_weights(checkpoint: dict[str, Any]) -> dict[str, torch.Tensor]:
     """The running average of a checkpoint's weights, named as the network's are."""
     prefix = "module."
@@ -312,7 +333,10 @@ def _frames_there(config: TrainingConfig) -> Callable[..., list[Path]]:
 def train(config: TrainingConfig) -> TrainingResult:
     """Trains a head on simulated scenes; interrupted, the same call goes on from the last checkpoint.
 
+    With `iterations` given, what comes out is then the same to the bit as if it had not been interrupted.
+
     Raises:
+        ModelError: A checkpoint is damaged, or that in `out` is of another network.
         RuntimeError: No frames come: the processes that make them have ended.
     """
     torch.set_num_threads(config.threads)
@@ -329,8 +353,14 @@ def train(config: TrainingConfig) -> TrainingResult:
     checkpoint = config.out / "checkpoint.pt"
     iteration, spent = 0, 0.0
     if checkpoint.exists():
-        state = torch.load(checkpoint, weights_only=True)
-        network.load_state_dict(state["network"])
+        state = read_checkpoint(checkpoint)
+        try:
+            network.load_state_dict(state["network"])
+        except RuntimeError as error:
+            raise ModelError(
+                f"{checkpoint}: of a training of another network; go on with the options that it began with, or train "
+                "into another folder"
+            ) from error
         averaged.load_state_dict(state["averaged"])
         optimiser.load_state_dict(state["optimiser"])
         iteration, spent = state["iteration"], state["minutes"]
@@ -339,7 +369,7 @@ def train(config: TrainingConfig) -> TrainingResult:
         network.begin_with(exported_weights(config.start_from, network))
         _log.info("starting from the head of %s", config.start_from)
     elif config.start_from is not None:
-        state = torch.load(config.start_from, weights_only=True)
+        state = read_checkpoint(config.start_from)
         network.begin_with(averaged_weights(state))
         _log.info("starting from %s at its iteration %d", config.start_from, state["iteration"])
 
@@ -370,8 +400,14 @@ def train(config: TrainingConfig) -> TrainingResult:
 
     network.train()
     last_saved = time.monotonic()
-    windows = Windows(config.kept)
-    for new in _fresh(config, iteration):
+    # A training that goes on draws the windows again that were known before: they follow from the seed.
+    fresh = config.fresh or config.batch
+    first = max(0, iteration - math.ceil(config.kept / fresh)) if fresh < config.batch else iteration
+    windows = Windows(config.kept, before=first * fresh)
+    for number, new in enumerate(_fresh(config, first), first):
+        if number < iteration:
+            windows.keep(new)
+            continue
         minutes = (time.monotonic() - began) / 60.0
         progress = iteration / config.iterations if config.iterations else minutes / float(config.minutes or 1.0)
         if progress >= 1.0:
@@ -399,7 +435,7 @@ def train(config: TrainingConfig) -> TrainingResult:
             _log.info(
                 "minute %.1f, %.1f left, iteration %d, %d frames: %s", minutes, left, iteration, len(there()), losses
             )
-        if time.monotonic() - last_saved > 120.0:
+        if time.monotonic() - last_saved > config.save_every:
             save()
             last_saved = time.monotonic()
     save()

@@ -193,15 +193,22 @@ class Windows:
 
     Args:
         capacity: How many are kept.
+        before: How many had been drawn before the first that it is given, of a training that goes on.
     """
 
-    def __init__(self, capacity: int):
+    def __init__(self, capacity: int, before: int = 0):
         self._capacity = capacity
-        self._kept: list[Window] = []
-        self._oldest = 0
+        self._kept: dict[int, Window] = {}
+        self._drawn = before
 
     def __len__(self) -> int:
         return len(self._kept)
+
+    def keep(self, new: Sequence[Window]) -> None:
+        """Takes them in, each in the place of one that is `capacity` older."""
+        for window in new:
+            self._kept[self._drawn % self._capacity] = window
+            self._drawn += 1
 
     def batch(self, new: Sequence[Window], size: int, random: np.random.Generator) -> Batch:
         """The new windows as they are, and of those before them as many as it takes, each turned at random."""
@@ -209,11 +216,6 @@ class Windows:
         for _ in range(size - len(chosen)):
             known = self._kept or chosen
             flips = random.random(3) < 0.5
-            chosen.append(turned(known[random.integers(len(known))], *(bool(flip) for flip in flips)))
-        for window in new:
-            if len(self._kept) < self._capacity:
-                self._kept.append(window)
-            else:
-                self._kept[self._oldest] = window
-                self._oldest = (self._oldest + 1) % self._capacity
+            chosen.append(turned(known[int(random.integers(len(known)))], *(bool(flip) for flip in flips)))
+        self.keep(new)
         return batched(chosen)

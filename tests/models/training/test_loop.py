@@ -1,6 +1,10 @@
 """The training loop on a handful of tiny scenes: it learns, resumes, repeats, and its export is a head that works."""
 
 import logging
+import pickle
+import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +26,7 @@ from warploom.models.training.frames import (
     save_frame,
     simulate_frame,
 )
-from warploom.models.training.loop import TrainingConfig, described, make_frames, make_views, train
+from warploom.models.training.loop import TrainingConfig, described, make_frames, make_views, read_checkpoint, train
 from warploom.models.training.network import EXTRAS, HEAD_CLASSES, LEAN_CHANNELS, REGRESSION, PillarCenterNet
 from warploom.models.training.targets import draw_targets, loss, overlap
 from warploom.models.training.windows import batched, window_of
@@ -128,6 +132,49 @@ def test_a_seed_repeats_and_a_checkpoint_resumes(tmp_path, frames_folder, caplog
         resumed = train(config(tmp_path / "a", frames_folder, 5))
     assert resumed.iterations == 5
     assert "resuming from iteration 3" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"fresh": 1, "kept": 3}, {"frozen": True}], ids=["", "known windows", "frozen"]
+)
+def test_a_training_that_was_killed_ends_as_if_it_had_not_been(tmp_path, frames_folder, options):
+    """Killed by SIGKILL in its sixth step, after the checkpoint of its fifth."""
+    whole = train(config(tmp_path / "whole", frames_folder, 8, **options))
+    settings = config(tmp_path / "killed", frames_folder, 8, save_every=0.0, **options)
+    script = (
+        "import os, pickle, signal, torch\n"
+        "from warploom.models.training.loop import train\n"
+        "average, steps = torch.optim.swa_utils.AveragedModel.update_parameters, iter(range(9))\n"
+        "def update(self, network):\n"
+        "    average(self, network)\n"
+        "    if next(steps) == 5:\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "torch.optim.swa_utils.AveragedModel.update_parameters = update\n"
+        f"train(pickle.loads(bytes.fromhex('{pickle.dumps(settings).hex()}')))\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -signal.SIGKILL
+    assert read_checkpoint(settings.out / "checkpoint.pt")["iteration"] == 5
+    resumed = train(settings)
+    assert resumed.iterations == whole.iterations == 8
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, resumed.network.state_dict()[name]), name
+
+
+def test_checkpoints_that_do_not_fit_are_named(tmp_path, frames_folder):
+    settings = config(tmp_path / "a", frames_folder, 1)
+    train(settings)
+    checkpoint = settings.out / "checkpoint.pt"
+    with pytest.raises(ModelError, match=r"checkpoint\.pt: of a training of another network; go on with the options"):
+        train(replace(settings, width=(8, 8, 16)))
+    other = config(tmp_path / "b", frames_folder, 1, start_from=tmp_path / "x.pt")
+    with pytest.raises(ModelError, match=r"x\.pt: cannot read the checkpoint: No such file"):
+        train(other)
+    torch.save({"model": torch.zeros(3)}, tmp_path / "x.pt")
+    with pytest.raises(ModelError, match=r"x\.pt: not a checkpoint of a training"):
+        train(other)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+    with pytest.raises(ModelError, match=r"checkpoint\.pt: the checkpoint is damaged"):
+        train(settings)
 
 
 def test_fewer_channels_and_a_further_branch_learn_too(tmp_path, frames_folder):

@@ -102,4 +102,4 @@ def test_new_windows_come_first_and_the_oldest_go():
         assert batch.pillars.shape[0] == 2
         torch.testing.assert_close(batch.pillars[:1], batched([each]).pillars)
     assert len(windows) == 3
-    assert {id(each) for each in windows._kept} == {id(each) for each in drawn[2:]}
+    assert {id(each) for each in windows._kept.values()} == {id(each) for each in drawn[2:]}
