@@ -17,7 +17,7 @@ import torch
 import warp as wp
 from torch.utils.data import DataLoader, IterableDataset
 
-from ...errors import ModelError
+from ...errors import ConfigError, ModelError
 from ...kernels.pillar import PillarGrid, pillar_channels
 from .bowing import bowed
 from .export import CARDS, exported_weights
@@ -104,6 +104,14 @@ class TrainingConfig:
         if (self.minutes is None) == (self.iterations is None):
             raise ValueError("give either minutes or iterations, not both and not neither")
         cells = 2.0 * self.window / self.cell
+        for name, least in (("seed", 0), ("batch", 1), ("kept", 1), ("threads", 1), ("workers", 0), ("iterations", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, not {value}")
+        for name in ("minutes", "learning_rate", "final_share"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be a number above 0, not {value}")
         if self.fresh is not None and not 1 <= self.fresh <= self.batch:
             raise ValueError(f"fresh must be from 1 to the batch, {self.batch}, not {self.fresh}")
         if self.loaders not in (0, 1):
@@ -116,6 +124,8 @@ class TrainingConfig:
             raise ValueError(f"views must be at least 1, not {self.views}")
         if cells != round(cells) or round(cells) % (4 * STRIDE):
             raise ValueError(f"2 · window / cell must be a multiple of {4 * STRIDE}, not {cells}")
+        with torch.device("meta"):  # without memory: whether there can be such a network
+            PillarCenterNet(self.width, self.depth, self.channels, self.extras)
 
     @property
     def folder(self) -> Path:
@@ -229,13 +239,13 @@ def _labelled(config: TrainingConfig) -> list[Path]:
     """The files of labelled scans.
 
     Raises:
-        FileNotFoundError: There are none in the folder.
+        ConfigError: There are none in the folder.
     """
     if config.labelled is None:
         return []
     found = sorted(path for path in config.labelled.glob("*.npz") if not path.name.endswith(".partial.npz"))
     if not found:
-        raise FileNotFoundError(f"{config.labelled}: no scans (.npz) here; `warploom head train --data` writes them")
+        raise ConfigError(f"{config.labelled}: no scans (.npz) here; `warploom head train --data` writes them")
     return found
 
 
@@ -336,6 +346,7 @@ def train(config: TrainingConfig) -> TrainingResult:
     With `iterations` given, what comes out is then the same to the bit as if it had not been interrupted.
 
     Raises:
+        ConfigError: There are no labelled scans in their folder.
         ModelError: A checkpoint is damaged, or that in `out` is of another network.
         RuntimeError: No frames come: the processes that make them have ended.
     """

@@ -97,6 +97,8 @@ class PillarCenterNet(nn.Module):
         for name, said, known in (("channels", channels, there), ("extras", extras, EXTRAS)):
             if unknown := [one for one in said if one not in known]:
                 raise ValueError(f"{name} must be of {', '.join(known)}, not {', '.join(unknown)}")
+        if min(width) < 1 or min(depth) < 0:
+            raise ValueError(f"width must be 1 or more each and depth 0 or more, not {width} and {depth}")
         fine, middle, coarse = width
         outputs = len(HEAD_CLASSES) + len(REGRESSION)
         self.extras = tuple(extras)

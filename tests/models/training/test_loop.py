@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from warploom.errors import ModelError
+from warploom.errors import ConfigError, ModelError
 from warploom.models.card import load_card
 from warploom.models.classes import CYCLIST, PEDESTRIAN, VEHICLE
 from warploom.models.head import DetectionHead
@@ -490,6 +490,26 @@ def test_contradicting_lengths_are_refused(tmp_path):
         TrainingConfig(out=tmp_path, iterations=1, window=8.1)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seed": -1}, "seed must be at least 0, not -1"),
+        ({"threads": 0}, "threads must be at least 1, not 0"),
+        ({"workers": -1}, "workers must be at least 0, not -1"),
+        ({"iterations": 0}, "iterations must be at least 1, not 0"),
+        ({"iterations": None, "minutes": float("nan")}, "minutes must be a number above 0, not nan"),
+        ({"learning_rate": float("inf")}, "learning_rate must be a number above 0, not inf"),
+        ({"final_share": -1.0}, "final_share must be a number above 0"),
+        ({"extras": ("mass",)}, "extras must be of iou"),
+        ({"width": (0, 48, 128)}, "width must be 1 or more each"),
+        ({"depth": (1, -1)}, "depth 0 or more"),
+    ],
+)
+def test_what_no_training_can_be_made_of_is_refused(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        TrainingConfig(out=tmp_path, **{"iterations": 1} | options)
+
+
 def test_a_training_begins_with_an_exported_head(tmp_path):
     """Batch norms were folded into the convolutions: the network says the same within 1e-5 of what it said."""
     torch.manual_seed(5)
@@ -527,7 +547,7 @@ def test_labelled_scans_are_learnt_from_as_they_are(tmp_path, frames_folder):
 
 
 def test_labelled_scans_that_are_not_there_are_named(tmp_path, frames_folder):
-    with pytest.raises(FileNotFoundError, match="no scans"):
+    with pytest.raises(ConfigError, match="no scans"):
         train(replace(config(tmp_path, frames_folder, 2), labelled=tmp_path))
     with pytest.raises(ValueError, match="labelled_share"):
         replace(config(tmp_path, frames_folder, 2), labelled_share=1.5)
