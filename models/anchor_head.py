@@ -22,7 +22,7 @@ from ..kernels.voxel import Voxelize
 from .anchor_card import AnchorCard
 from .card import load_card
 from .classes import CLASSES
-from .detections import Detections
+from .detections import Detections, checked_height, said_overflow
 from .network import Network
 
 __all__ = ["AnchorHead"]
@@ -156,11 +156,15 @@ class AnchorHead:
 
         Returns:
             Boxes in the sensor's frame, best score first; velocities are NaN, as one scan does not show them.
+
+        Raises:
+            ValueError: A height that is not finite, where it is a number.
         """
-        if isinstance(sensor_height, wp.array):
-            wp.copy(self._height, sensor_height)
+        height = checked_height(sensor_height)
+        if isinstance(height, wp.array):
+            wp.copy(self._height, height)
         else:
-            self._height.fill_(float(sensor_height))
+            self._height.fill_(height)
         extra = None
         if self.needs_intensity:
             extra = intensity
@@ -189,6 +193,10 @@ class AnchorHead:
             points: Shape (n, 3 or more), x y z in the sensor's frame [m], and intensity in [0, 1] as the fourth column;
                 any array family.
             sensor_height: Height of the sensor above the ground [m].
+
+        Raises:
+            TypeError: `points` is no array of a floating type.
+            ValueError: It has not at least three columns, or the height is not finite.
         """
         borrowed = borrow_points(points)
         xyz, intensity = borrowed.xyz, borrowed.intensity
@@ -206,13 +214,15 @@ class AnchorHead:
 
     def _read(self) -> Detections:
         kept = int(self._nms.keep_count.numpy()[0])
-        self.overflow = (
-            int(self._voxelize.dropped.numpy()[1])
-            + int(self._decode.dropped.numpy()[0])
-            + int(self._nms.dropped.numpy()[0])
+        pillars, read = self.card.pillars, self.card.read
+        limits = (
+            ("pillars.max_pillars", pillars.max_pillars, int(self._voxelize.dropped.numpy()[1])),
+            ("read.max_candidates", read.max_candidates, int(self._decode.dropped.numpy()[0])),
+            ("read.max_objects", read.max_objects, int(self._nms.dropped.numpy()[0])),
         )
+        self.overflow = sum(beyond for _, _, beyond in limits)
         if self.overflow:
-            _log.warning("%s: %d beyond the card's limits were dropped", self.card.name, self.overflow)
+            _log.warning("%s: beyond the card's limits: %s", self.card.name, said_overflow(limits))
         if kept == 0:
             return Detections.empty()
         keep = self._nms.keep.numpy()[:kept]

@@ -1,12 +1,18 @@
-"""What a detector says of one frame."""
+"""What a detector is told of one frame, and what it says of it."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-__all__ = ["Detections"]
+from ..kernels.arguments import real
+
+__all__ = ["Detections", "checked_height", "said_overflow"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,3 +59,29 @@ class Detections:
             velocities=self.velocities[which],
             background=self.background[which],
         )
+
+
+def checked_height(sensor_height: Any) -> float | wp.array:
+    """The height of a sensor above the ground as heads take it; an array stays as it is, on its device.
+
+    Raises:
+        TypeError: It is neither a number nor an array of Warp's.
+        ValueError: It is not finite.
+    """
+    if isinstance(sensor_height, wp.array):
+        return sensor_height
+    height = real(sensor_height, "sensor_height")
+    if not math.isfinite(height):
+        raise ValueError(f"sensor_height must be a finite number of metres, not {sensor_height}")
+    return height
+
+
+def said_overflow(limits: Iterable[tuple[str, int, int]]) -> str:
+    """Which limits of a head's card were too low for a cloud, for people.
+
+    Args:
+        limits: Of each its key on the card, what it allows, and how many were dropped beyond it.
+    """
+    return "; ".join(
+        f"dropped {beyond} of {allowed + beyond}, for {name} is {allowed}" for name, allowed, beyond in limits if beyond
+    )

@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import ModelError
+from ..kernels.arguments import whole
 from ..kernels.box_refine import BoxRefine
 from ..kernels.decode import CenterDecode
 from ..kernels.device import resolve_device
@@ -24,7 +25,7 @@ from ..kernels.nms import RotatedNms
 from ..kernels.pillar import PillarGrid, pillar_channels
 from .card import HeadCard, default_card, load_card
 from .classes import CLASSES
-from .detections import Detections
+from .detections import Detections, checked_height, said_overflow
 from .network import PRECISIONS, PROVIDERS, Network
 from .second_stage import SecondStage
 
@@ -74,7 +75,10 @@ class _Slot:
         )
         self.found = (self.decode.boxes, self.decode.scores, self.decode.classes_found)
         self.kept = self.nms
-        self.dropped = [self.decode.dropped, self.nms.dropped]
+        self.dropped = [
+            ("decode.max_candidates", decode.max_candidates, self.decode.dropped),
+            ("decode.max_objects", decode.max_objects, self.nms.dropped),
+        ]
 
 
 class DetectionHead:
@@ -119,6 +123,7 @@ class DetectionHead:
     ):
         if score_threshold is not None and not 0.0 <= score_threshold <= 1.0:
             raise ValueError(f"score_threshold must be in [0, 1], not {score_threshold}")
+        batch = whole(batch, "batch")
         if not 1 <= batch <= 127:
             raise ValueError(f"batch must be 1 to 127, not {batch}")
         self.device = resolve_device(device)
@@ -162,7 +167,8 @@ class DetectionHead:
                 look = self._second.look(row)
                 slot.found = (look.rescore.boxes_out, look.rescore.scores, look.rescore.kinds)
                 slot.kept = look.nms
-                slot.dropped += [look.rescore.dropped, look.nms.dropped]
+                slot.dropped.append(("second.max_boxes", self.card.second.max_boxes, look.rescore.dropped))
+                slot.dropped.append(("decode.max_objects", self.card.decode.max_objects, look.nms.dropped))
         self._maps = wp.zeros((batch, *self.card.output.shape[1:]), dtype=wp.float32, device=self.device)
         # One cloud's grid is read where our kernel draws it; those of several are gathered into one array.
         self._grids = (
@@ -186,8 +192,11 @@ class DetectionHead:
         Returns:
             Boxes in the sensor's frame, best score first; velocities are NaN, as one scan does not show them. A box
             that holds the sensor is of the vehicle that carries it, or of the hole around it, and is left out.
+
+        Raises:
+            ValueError: A height that is not finite, where it is a number.
         """
-        return self._detect([(xyz, count, sensor_height)])[0]
+        return self._detect([(xyz, count, checked_height(sensor_height))])[0]
 
     def detect_points(self, points: Any, sensor_height: float) -> Detections:
         """The objects of a cloud given as any array of points.
@@ -195,6 +204,10 @@ class DetectionHead:
         Args:
             points: Shape (n, 3 or more), x y z in the sensor's frame [m]; any array family.
             sensor_height: Height of the sensor above the ground [m].
+
+        Raises:
+            TypeError: `points` is no array of a floating type.
+            ValueError: It has not at least three columns, or the height is not finite.
         """
         return self.detect_batch([points], [sensor_height])[0]
 
@@ -206,7 +219,9 @@ class DetectionHead:
             sensor_heights: Height of each one's sensor above the ground [m].
 
         Raises:
-            ValueError: More clouds than `batch`, none, or not as many heights.
+            TypeError: A cloud is no array of a floating type.
+            ValueError: More clouds than `batch`, none, or not as many heights; or a cloud that has not at least three
+                columns, or a height that is not finite.
         """
         if not 1 <= len(clouds) <= self.batch or len(sensor_heights) != len(clouds):
             raise ValueError(
@@ -220,7 +235,7 @@ class DetectionHead:
             if borrowed.device != self.device:
                 xyz = wp.clone(xyz.contiguous(), device=self.device)
             slot.count.fill_(len(borrowed))
-            given.append((xyz, slot.count, height))
+            given.append((xyz, slot.count, checked_height(height)))
         return self._detect(given)
 
     def warm_up(self) -> None:
@@ -255,10 +270,10 @@ class DetectionHead:
 
     def _read(self, slot: _Slot) -> Detections:
         kept = int(slot.kept.keep_count.numpy()[0])
-        dropped = sum(int(count.numpy()[0]) for count in slot.dropped)
-        if dropped:
+        limits = [(name, allowed, int(count.numpy()[0])) for name, allowed, count in slot.dropped]
+        if dropped := sum(beyond for _, _, beyond in limits):
             self.overflow += dropped
-            _log.warning("%s: %d detections beyond the card's limits were dropped", self.card.name, dropped)
+            _log.warning("%s: beyond the card's limits: %s", self.card.name, said_overflow(limits))
         if kept == 0:
             return Detections.empty()
         boxes, scores, kinds = (array.numpy() for array in slot.found)

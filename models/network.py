@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from ..errors import ModelError
+from ..kernels.arguments import whole
 from .onnx_file import with_batch
 
 __all__ = [
@@ -106,12 +107,12 @@ class Network:
         batch: int = 1,
         classes: Sequence[str] | None = None,
     ):
-        if threads < 1:
+        if whole(threads, "threads") < 1:
             raise ValueError(f"threads must be at least 1, not {threads}")
         if precision not in PRECISIONS:
             raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}, not {precision!r}")
-        if providers is not None and (not providers or set(providers) - set(PROVIDERS)):
-            raise ValueError(f"providers must be some of {', '.join(PROVIDERS)}, not {list(providers)}")
+        if providers is not None and (isinstance(providers, str) or not providers or set(providers) - set(PROVIDERS)):
+            raise ValueError(f"providers must be some of {', '.join(PROVIDERS)}, in a list, not {providers!r}")
         self.device, self.batch = device, batch
         self._stream = None if device == "cpu" else wp.get_stream(device)
         self._session, self.provider, self.fallback = self._load(model, threads, precision, providers)
@@ -127,7 +128,7 @@ class Network:
         import onnxruntime as ort
 
         options = ort.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = int(threads)
         options.inter_op_num_threads = 1
         # A thread that waits by spinning takes a core from the stages that run beside the head.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")

@@ -15,9 +15,10 @@ import warp as wp
 from pydantic import Field
 
 from ..kernels.device import resolve_device
+from ..kernels.interop import borrow_points
 from .card import LidarCard, load_card
 from .classes import class_index
-from .detections import Detections
+from .detections import Detections, checked_height
 from .network import Network
 
 __all__ = ["OccupancyCard", "OccupancyHead", "boxes_of_corners"]
@@ -154,21 +155,25 @@ class OccupancyHead:
             count: Number of points, shape (1,), int32.
             sensor_height: Height of the sensor above the ground [m]: a number or a device array of one float32.
         """
-        height = float(sensor_height.numpy()[0]) if isinstance(sensor_height, wp.array) else float(sensor_height)
+        height = float(sensor_height.numpy()[0]) if isinstance(sensor_height, wp.array) else sensor_height
         return self.detect_points(xyz.numpy()[: int(count.numpy()[0])], height)
 
     def detect_points(self, points: Any, sensor_height: float) -> Detections:
         """The vehicles of a cloud given as an array.
 
         Args:
-            points: Shape (n, 3 or more), x y z in the sensor's frame [m].
+            points: Shape (n, 3 or more), x y z in the sensor's frame [m]; any array family.
             sensor_height: Height of the sensor above the ground [m].
 
         Returns:
             Boxes in the sensor's frame, best score first.
+
+        Raises:
+            TypeError: `points` is no array of a floating type.
+            ValueError: It has not at least three columns, or the height is not finite.
         """
-        lift = sensor_height - self.card.sensor_height
-        self._occupy(np.asarray(points, np.float32)[:, :3], lift)
+        lift = checked_height(sensor_height) - self.card.sensor_height
+        self._occupy(borrow_points(points).xyz.numpy(), lift)
         if self.device != "cpu":
             self._in.assign(self._host)
         self._network.run()

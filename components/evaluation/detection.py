@@ -210,7 +210,7 @@ def lines_of(result: DetectionEvaluation) -> list[str]:
         if scores.get("detection_score") is not None:
             lines.append(f"  nuScenes detection score: {scores['detection_score']:.3f}")
     if result.dropped:
-        lines.append(f"{result.dropped} detections were beyond the limits of the head's card")
+        lines.append(f"{result.dropped} detections were beyond the limits of the head's card, which the log names")
     if result.head.get("fallback"):
         lines.append(f"provider: {result.head['fallback']}")
     return lines

@@ -7,6 +7,7 @@ centre and log size of a box at each cell of three strides, how sure it is of an
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +18,14 @@ import warp as wp
 from ...kernels.device import resolve_device
 from ...kernels.nms import rotated_nms
 from ..card import load_card
+from ..detections import said_overflow
 from ..network import Network
 from .card import ImageDetectorCard
 from .images import checked_image, fit_image
 
 __all__ = ["ImageDetections", "ImageDetector"]
+
+_log = logging.getLogger(__name__)
 
 _APART = 1e5  # pixels between boxes of classes that are suppressed each by itself
 
@@ -141,6 +145,9 @@ class ImageDetector:
             flat[:, 0] += labels * _APART
         keep = rotated_nms(flat, scores.astype(np.float32), read.nms_iou)
         self.overflow = max(0, len(keep) - read.max_objects)
+        if self.overflow:
+            limit = ("read.max_objects", read.max_objects, self.overflow)
+            _log.warning("%s: beyond the card's limits: %s", self.card.name, said_overflow([limit]))
         keep = keep[: read.max_objects]
         return boxes[keep], scores[keep], labels[keep]
 

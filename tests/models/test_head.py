@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from warploom.errors import ModelError
+from warploom.models.card import DEFAULT_CARD, load_card, save_card
 from warploom.models.classes import CLASSES, VEHICLE
 from warploom.models.geometry import KittiCalibration, points_in_boxes
 from warploom.models.head import DetectionHead
@@ -192,6 +193,33 @@ def test_the_head_reads_its_grid_where_it_was_drawn(head, scenes):
     grid = head._slots[0].pillars.grid
     assert head._grids.ptr == grid.ptr
     assert np.from_dlpack(grid).ctypes.data == grid.ptr
+
+
+@pytest.mark.parametrize(("height", "error"), [(np.nan, ValueError), (-np.inf, ValueError), (None, TypeError),
+                                               ("1.7", TypeError)])  # fmt: skip
+def test_a_height_that_is_none_is_refused_by_name(head, scenes, height, error):
+    points = scenes[0][0]
+    with pytest.raises(error, match=r"sensor_height must be a .*number"):
+        head.detect_points(points, height)
+    xyz = wp.array(np.ascontiguousarray(points[:, :3]), dtype=wp.vec3, device="cpu")
+    with pytest.raises(error, match=r"sensor_height must be a .*number"):
+        head.detect(xyz, wp.array([len(points)], dtype=wp.int32, device="cpu"), sensor_height=height)
+
+
+def test_a_limit_of_the_card_that_was_too_low_is_named(scenes, tmp_path, caplog):
+    card, model = load_card(DEFAULT_CARD)
+    for file in (card.file, card.second.file):
+        (tmp_path / file).write_bytes((model.parent / file).read_bytes())
+    many = DetectionHead(DEFAULT_CARD, candidates_only=True)
+    found = len(many.detect_points(scenes[0][0], 1.8))
+    decode = card.decode.model_copy(update={"max_objects": 3})
+    save_card(tmp_path / "few.yaml", card.model_copy(update={"decode": decode}))
+    few = DetectionHead(tmp_path / "few.yaml", candidates_only=True)
+    few.detect_points(scenes[0][0], 1.8)
+    assert f"pillar_center: beyond the card's limits: dropped {found - 3} of {found}, for decode.max_objects is 3" in (
+        caplog.text
+    )
+    assert few.overflow == found - 3 > 0
 
 
 def test_a_missing_provider_is_said_or_refused(caplog):

@@ -124,3 +124,7 @@ def test_wrong_arguments_are_refused(model):
         Network(model, *SPEC, providers=("rocm",))
     with pytest.raises(ValueError, match="providers must be some of"):
         Network(model, *SPEC, providers=())
+    with pytest.raises(ValueError, match="in a list, not 'cpu'"):
+        Network(model, *SPEC, providers="cpu")
+    with pytest.raises(ValueError, match=r"threads must be a whole number, not 1\.5"):
+        Network(model, *SPEC, threads=1.5)

@@ -1,5 +1,7 @@
 """Detectors in images against decoding as their authors write it, as loops, on what ONNX Runtime gives."""
 
+import re
+
 import numpy as np
 import onnx
 import pytest
@@ -171,6 +173,14 @@ def test_what_is_no_image_is_refused(small_head):
         with pytest.raises(ValueError, match="image must be uint8 of shape"):
             head.detect(image)
     assert len(head.detect(np.zeros((1, 1000, 3), np.uint8))) >= 0
+
+
+def test_objects_beyond_the_cards_limit_are_told(small_head, caplog):
+    small_head.write_text(re.sub(r"max_objects: \d+", "max_objects: 5", small_head.read_text()))
+    head = ImageDetector(small_head)
+    assert len(head.detect(np.zeros((64, 64, 3), np.uint8))) == 5
+    there = head.overflow + 5
+    assert f"beyond the card's limits: dropped {there - 5} of {there}, for read.max_objects is 5" in caplog.text
 
 
 def test_a_card_of_other_classes_is_refused(small_head):

@@ -93,6 +93,14 @@ def test_its_boxes_are_those_of_its_reference(shared_data, tmp_path, one_thread)
         assert (np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < 0.01).all()
         scores = np.array([each["score"] for each in reference])[nearest]
         np.testing.assert_allclose(found.scores, scores, atol=2e-3)
+    again = head.detect_points(torch.from_numpy(points), 1.73)
+    assert again.boxes.tobytes() == found.boxes.tobytes()
+    for wrong, height, message in (
+        (points, np.nan, "sensor_height must be a finite number of metres"),
+        (points[:, :2], 1.73, r"points must have shape \(n, 3 or more\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            head.detect_points(wrong, height)
 
 
 def test_other_and_damaged_files_are_refused(tmp_path):

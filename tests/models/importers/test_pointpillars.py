@@ -294,6 +294,16 @@ def test_little_or_no_cloud_is_no_error(cloud, tmp_path):
     assert np.isfinite(head.detect_points(cloud.astype(np.float32), 1.73).boxes).all()
 
 
+def test_limits_of_the_card_are_named_and_heights_checked(points, tmp_path, caplog):
+    path, _ = saved(tmp_path, "openpcdet")
+    head = AnchorHead(import_pointpillars(path, tmp_path, spec=spec(max_objects=2, nms_iou=1.0)))
+    head.detect_points(points, 1.73)
+    there = head.overflow + 2
+    assert f"beyond the card's limits: dropped {there - 2} of {there}, for read.max_objects is 2" in caplog.text
+    with pytest.raises(ValueError, match="sensor_height must be a finite number of metres, not nan"):
+        head.detect_points(points, np.nan)
+
+
 def test_the_card_says_what_the_head_needs(tmp_path):
     path, _ = saved(tmp_path, "openpcdet")
     card, _ = load_card(import_pointpillars(path, tmp_path, spec=spec()), AnchorCard)
