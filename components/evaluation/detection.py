@@ -1,8 +1,8 @@
 """`warploom eval detection`: a detection head on data sets with truth and on the simulator, from scans to scores.
 
-Frames of one kind are scored together: KITTI's by its own average precision and, in the camera's view, by what is found
-and what is false; the simulator's and nuScenes' all round, by nuScenes' measures too; range images by the points of
-cars that lie in boxes.
+Frames of one kind, and of one sensor where there are several, are scored together: KITTI's by its own average precision
+and, in the camera's view, by what is found and what is false; the simulator's and nuScenes' all round, by nuScenes'
+measures too; range images by the points of cars that lie in boxes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class DetectionEvaluation:
     dropped: int = 0
     """Detections above `LEAST_SCORE` that were beyond the head's limits."""
     sets: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Figures by kind of the frames."""
+    """Figures by kind of the frames, or by kind and sensor (`sim vlp16`) where a kind's are of several."""
 
     @property
     def false(self) -> list[FalseDetection]:
@@ -153,10 +153,21 @@ def evaluate_detection(
     if not outcomes:
         raise ConfigError(f"{', '.join(data) or 'no data'}: no frames to evaluate")
     sets = {
-        kind: figures_of(kind, [each for each in outcomes if each.frame.kind == kind], score, also, review)
-        for kind in dict.fromkeys(each.frame.kind for each in outcomes)
+        name: figures_of(some[0].frame.kind, some, score, also, review) for name, some in _by_sensor(outcomes).items()
     }
     return DetectionEvaluation(head=said, outcomes=outcomes, score=score, dropped=dropped, sets=sets)
+
+
+def _by_sensor(outcomes: Sequence[FrameOutcome]) -> dict[str, list[FrameOutcome]]:
+    """The frames that are scored together, by the name of their figures."""
+    sensors: dict[str, dict[str, list[FrameOutcome]]] = {}
+    for each in outcomes:
+        sensors.setdefault(each.frame.kind, {}).setdefault(each.frame.sensor, []).append(each)
+    return {
+        kind if len(parts) == 1 else f"{kind} {sensor}": some
+        for kind, parts in sensors.items()
+        for sensor, some in parts.items()
+    }
 
 
 def _score_of(card: Any) -> float:
@@ -182,12 +193,13 @@ def lines_of(result: DetectionEvaluation) -> list[str]:
             lines.append(f"  from score {score}")
             for name, value in at.items():
                 if name == "tasks":
-                    lines += [f"    {task:<34} {n['found']}/{n['objects']}" for task, n in value.items()]
+                    lines += [f"    {task:<34} {_share(n)}" for task, n in value.items()]
                 elif isinstance(value, dict):
                     said = ", ".join(f"{key} {number:g}" for key, number in value.items())
                     lines.append(f"    {name.replace('_', ' '):<34} {said}")
                 else:
-                    lines.append(f"    {name.replace('_', ' '):<34} {value:g}")
+                    said = "none there" if value is None else f"{value:g}"
+                    lines.append(f"    {name.replace('_', ' '):<34} {said}")
         for name, recall in figures.get("recall", {}).items():
             for by, unit in (("by_range", "m"), ("by_points", "points")):
                 bins = [each for each in recall[by] if each["objects"]]
@@ -214,6 +226,10 @@ def lines_of(result: DetectionEvaluation) -> list[str]:
     if result.head.get("fallback"):
         lines.append(f"provider: {result.head['fallback']}")
     return lines
+
+
+def _share(task: dict[str, int]) -> str:
+    return f"{task['found']}/{task['objects']}" if task["objects"] else "none there"
 
 
 def _span(each: dict[str, Any]) -> str:

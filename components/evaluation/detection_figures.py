@@ -196,7 +196,8 @@ def _false_of(outcome: FrameOutcome, index: int, score: float) -> int:
     return int((nearest_detections(found.boxes[own], frame.boxes[there]).distance > 1.0).sum())
 
 
-def _car_points(outcomes: list[FrameOutcome], score: float) -> float:
+def _car_points(outcomes: list[FrameOutcome], score: float) -> float | None:
+    """The share of the points on cars that lie in boxes of vehicles; None where there are no such points."""
     inside = total = 0
     for each in outcomes:
         labels = each.frame.point_labels
@@ -207,7 +208,7 @@ def _car_points(outcomes: list[FrameOutcome], score: float) -> float:
         boxes = each.found.boxes[(each.found.classes == VEHICLE) & (each.found.scores >= score)]
         within = points_in_boxes(points, boxes, margin=BOXES_GROWN).any(axis=0)
         inside, total = inside + int((within & car).sum()), total + int(car.sum())
-    return round(inside / total, 4) if total else math.nan
+    return round(inside / total, 4) if total else None
 
 
 def _recall(outcomes: list[FrameOutcome], index: int, score: float) -> dict[str, Any]:

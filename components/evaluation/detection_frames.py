@@ -74,6 +74,8 @@ class EvaluationFrame:
     """Data set and number, unique in an evaluation."""
     kind: str
     """One of `KINDS`."""
+    sensor: str
+    """What took the scan, as far as the data tell; frames of several sensors are not scored together."""
     points: np.ndarray
     """Shape (n, 3 or more), float32."""
     sensor_height: float
@@ -190,6 +192,7 @@ def _kitti(uri: str, place: str, keys: dict[str, str]) -> Iterator[EvaluationFra
         yield EvaluationFrame(
             name="/".join([root.resolve().name, *path.relative_to(root).parts[1:-1], path.stem]),
             kind="kitti",
+            sensor="hdl64",
             points=points,
             sensor_height=height,
             boxes=boxes,
@@ -220,6 +223,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
         lidar = options.get("lidar", lidar_model, None)
         if seeds.stop > _HELD_OUT:
             raise ConfigError(f"{uri}: seeds from {_HELD_OUT} on are trained on; take lower ones")
+        sensor = "drawn by seed" if lidar is None else lidar.name
         named = ((f"scene {seed}", sample_scene(seed, lidar=lidar, visibility=True)) for seed in seeds)
     else:
         options = _Keys(uri, keys, ("seed", "lidar", "duration", "rate", "every", "height", "mounting_height"))
@@ -229,6 +233,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
             drive = Simulator(scenario=place, turning=False, visibility=True, **arguments)
         except ValueError as error:
             raise ConfigError(f"{uri}: {error}") from None
+        sensor = drive.lidar.name
         steps = range(0, len(drive), options.get("every", _every, 1))
         named = ((f"{place} {drive.seed}, frame {index}", drive.frame(index)) for index in steps)
     height = options.get("height", _number, None)
@@ -236,6 +241,7 @@ def _simulated(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluatio
         yield EvaluationFrame(
             name=name,
             kind="sim",
+            sensor=sensor,
             points=frame.points,
             sensor_height=height_over_ground(frame.points, frame.ground) if height is None else height,
             boxes=labelled_boxes(np.asarray(frame.boxes, np.float64), frame.classes),
@@ -270,6 +276,7 @@ def _nuscenes(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evaluation
         yield EvaluationFrame(
             name=f"nuscenes/{file.name.split('__')[-1].split('.')[0]}",
             kind="nuscenes",
+            sensor="hdl32",
             points=points,
             sensor_height=height,
             boxes=boxes,
@@ -308,6 +315,7 @@ def _range_images(uri: str, place: str, keys: dict[str, str]) -> Iterator[Evalua
         yield EvaluationFrame(
             name=f"{root.name}/{path.stem}",
             kind="range",
+            sensor="x".join(map(str, hit.shape)),
             points=points,
             sensor_height=options.get("height", _number, usual),
             boxes=np.empty((0, 7)),

@@ -60,7 +60,7 @@ def test_only_what_has_labels_is_kept(kitti, tmp_path):
 def test_what_cannot_be_learnt_from_is_named(kitti, tmp_path):
     with pytest.raises(ConfigError, match="expected one of kitti"):
         write_labelled_scans("drives", tmp_path / "scans")
-    with pytest.raises(SourceError):
+    with pytest.raises(ConfigError, match="nowhere is not there"):
         write_labelled_scans(f"kitti:{tmp_path / 'nowhere'}", tmp_path / "scans")
     (kitti / "label_2" / "000007.txt").write_text("Car 0.00 0\n")
     with pytest.raises(SourceError, match=r"000007\.txt, line 1"):

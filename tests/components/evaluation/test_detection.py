@@ -1,13 +1,15 @@
 """`warploom eval detection` on a KITTI folder made here, where every figure is known, and on real scans."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from warploom.cli import app
-from warploom.components.evaluation.detection import evaluate_detection, write_summary
+from warploom.components.evaluation.detection import evaluate_detection, lines_of, write_summary
 from warploom.components.evaluation.detection_figures import figures_of
 from warploom.components.evaluation.detection_frames import EvaluationFrame, evaluation_frames
 from warploom.components.evaluation.detection_outcomes import judge
@@ -103,6 +105,30 @@ def test_the_command_scores_result_files(kitti, tmp_path):
     assert run.exit_code == 0, run.output
     assert "cars within 1 m                    2/3" in run.output
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_what_there_is_nothing_of_is_no_share_of_it(kitti, tmp_path):
+    """No pedestrians among the labels, and a range image without cars: neither 0/0 nor nan."""
+    np.savez(tmp_path / "0.npz", xyz=np.ones((2, 3, 3), np.float32), depth=np.ones((2, 3)), label=np.full((2, 3), 15))
+    result = evaluate_detection([f"kitti:{kitti}"], kitti / "results", score=0.5)
+    assert f"    {'pedestrians within 0.5 m':<34} none there" in lines_of(result)
+    frame = next(evaluation_frames(f"range:{tmp_path}"))
+    figures = figures_of("range", [judge(frame, Detections.empty(), 0.0, 0.5, None)], 0.5, (), None)
+    assert figures["at"]["0.5"]["car_points_in_boxes"] is None
+    result = replace(result, sets={"range": figures})
+    assert f"    {'car points in boxes':<34} none there" in lines_of(result)
+    write_summary(result, tmp_path)
+    assert "NaN" not in (tmp_path / "summary.json").read_text()
+
+
+def test_scans_of_several_sensors_are_scored_apart():
+    card = SimpleNamespace(name="blind", sha256="", score_threshold=0.5)
+    head = SimpleNamespace(card=card, provider="cpu", fallback="", overflow=0, warm_up=lambda: None,
+                           detect_points=lambda *_: Detections.empty())  # fmt: skip
+    few, many = (f"sim:scenes?seeds={seeds}" for seeds in ("500", "501-502"))
+    result = evaluate_detection([f"{few}&lidar=vlp16", f"{many}&lidar=hdl32", f"{few}&lidar=hdl32"], head)
+    assert {name: each["frames"] for name, each in result.sets.items()} == {"sim vlp16": 1, "sim hdl32": 3}
+    assert list(evaluate_detection([f"{few}&lidar=vlp16"], head).sets) == ["sim"], "one alone needs no name"
 
 
 def test_damaged_data_are_named(kitti):
@@ -291,7 +317,7 @@ def test_what_is_found_beyond_the_range_is_neither_right_nor_wrong(tmp_path):
     """AP from above within 60 m: a box out there is left out, a wrong one within it is not."""
     boxes = np.array([[x, 0, 0, 4, 2, 2, 0] for x in (10.0, 70.0)], np.float64)
     frame = EvaluationFrame(
-        name="one", kind="sim", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
+        name="one", kind="sim", sensor="hdl64", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
         classes=np.zeros(2, np.int32), types=("object",) * 2, counts=np.full(2, 50), velocities=np.zeros((2, 2)),
     )  # fmt: skip
 
@@ -324,7 +350,7 @@ def test_what_is_hidden_for_the_most_part_is_told_apart_where_that_is_known():
 
     def average(visible):
         frame = EvaluationFrame(
-            name="one", kind="sim", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
+            name="one", kind="sim", sensor="hdl64", points=np.zeros((1, 3), np.float32), sensor_height=1.7, boxes=boxes,
             classes=np.zeros(2, np.int32), types=("object",) * 2, counts=np.full(2, 50), velocities=np.zeros((2, 2)),
             visible=visible,
         )  # fmt: skip
