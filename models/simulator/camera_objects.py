@@ -13,6 +13,7 @@ import numpy as np
 
 from ..classes import CYCLIST, PEDESTRIAN, VEHICLE
 from ..geometry import box_corners
+from .arguments import check_numbers
 from .cameras import Camera
 from .frame import SimulatedFrame
 
@@ -53,6 +54,12 @@ class CameraDetector:
     """How often one of `half_height` is taken for another class; less in proportion to its height."""
     false_objects: float = 0.3
     """Mean number in an image."""
+
+    def __post_init__(self):
+        check_numbers(
+            self, above_0=("half_height",), from_0=("edge_noise", "size_noise", "false_objects"),
+            shares=("best", "confusion"),
+        )  # fmt: skip
 
     def detect(self, frame: SimulatedFrame, camera: Camera, *, seed: int) -> CameraDetections:
         """What is found of the objects of a frame.

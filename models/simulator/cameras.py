@@ -9,6 +9,7 @@ import numpy as np
 
 from ...kernels.raycast import LidarCast
 from ...kernels.visibility import visible_shares
+from .arguments import check_numbers, check_pose, check_whole
 from .labels import Material, PointClass, material_table
 from .library import Library
 from .sweep import set_scene
@@ -53,12 +54,12 @@ class Camera:
     """Nothing is drawn beyond [m]."""
 
     def __post_init__(self):
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width and height must be at least 1 pixel, not {self.width} × {self.height}")
-        if not 0 < self.field_of_view < 180:
+        check_whole(self.width, "width", 1)
+        check_whole(self.height, "height", 1)
+        check_numbers(self, above_0=("field_of_view", "max_range"))
+        if self.field_of_view >= 180:
             raise ValueError(f"field_of_view must be above 0 and below 180 degrees, not {self.field_of_view}")
-        if np.shape(self.lidar_from_body) != (4, 4):
-            raise ValueError(f"lidar_from_body must have shape (4, 4), not {np.shape(self.lidar_from_body)}")
+        check_pose(self.lidar_from_body, "lidar_from_body")
 
     @property
     def intrinsics(self) -> np.ndarray:

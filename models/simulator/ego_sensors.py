@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .arguments import check_numbers
+
 __all__ = ["Gnss", "GnssModel", "Imu", "ImuModel", "WheelSpeed", "WheelSpeedModel", "local_from_geodetic"]
 
 _GRAVITY = 9.80665  # [m/s²]
@@ -55,6 +57,9 @@ class ImuModel:
     """Random walk of the bias [m/s² / √s]."""
     angular_rate_walk: float = 2.0e-5
     """[rad/s / √s]."""
+
+    def __post_init__(self):
+        check_numbers(self, above_0=("rate",), from_0=[name for name in vars(self) if name != "rate"])
 
     def measure(self, pose_at: PoseAt, duration: float, seed: int) -> Imu:
         """What is measured of a motion from 0 to `duration` [s].
@@ -120,10 +125,16 @@ class GnssModel:
     velocity_noise: float = 0.05
     """[m/s]."""
 
+    def __post_init__(self):
+        check_numbers(self, above_0=("rate", "drift_time"), from_0=("noise", "drift", "velocity_noise"))
+
     def measure(
         self, pose_at: PoseAt, duration: float, seed: int, *, outages: Sequence[tuple[float, float]] = ()
     ) -> Gnss:
         """The fixes from 0 to `duration` [s], none of them within `outages` (beginning and end [s])."""
+        for begin, end in outages:
+            if not begin <= end:
+                raise ValueError(f"outages must be pairs of a beginning and an end not before it, not {(begin, end)}")
         random = np.random.default_rng([seed & 0x7FFFFFFF, 29])
         t = _times(duration, self.rate)
         position = np.array([pose_at(at)[:3, 3] for at in t])
@@ -172,6 +183,9 @@ class WheelSpeedModel:
     step: float = 0.01
     """What one count of the encoder is [m/s]."""
 
+    def __post_init__(self):
+        check_numbers(self, above_0=("rate", "step"), from_0=("scale", "noise"))
+
     def measure(self, pose_at: PoseAt, duration: float, seed: int) -> WheelSpeed:
         """What the wheels say from 0 to `duration` [s]."""
         random = np.random.default_rng([seed & 0x7FFFFFFF, 31])
@@ -184,8 +198,7 @@ class WheelSpeedModel:
 
 
 def _times(duration: float, rate: float) -> np.ndarray:
-    if not (duration > 0 and rate > 0):
-        raise ValueError(f"duration and rate must be > 0, not {duration} and {rate}")
+    check_numbers({"duration": duration}, above_0=("duration",))
     return np.arange(max(1, round(duration * rate))) / rate
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..classes import BARRIER, CONE, CYCLIST, PEDESTRIAN, VEHICLE
+from .arguments import check_numbers, check_pose
 from .frame import SimulatedFrame
 
 __all__ = ["Radar", "RadarFrame"]
@@ -59,6 +60,15 @@ class Radar:
     """Standard deviation [m/s]."""
     false_targets: float = 1.5
     """Mean number in a cycle."""
+
+    def __post_init__(self):
+        check_numbers(
+            self, above_0=("field_of_view", "max_range", "reach"),
+            from_0=("range_noise", "azimuth_noise", "velocity_noise", "false_targets"),
+        )  # fmt: skip
+        if self.field_of_view > 360:
+            raise ValueError(f"field_of_view must be above 0 and at most 360 degrees, not {self.field_of_view}")
+        check_pose(self.lidar_from_radar, "lidar_from_radar")
 
     def measure(self, frame: SimulatedFrame, *, velocity: np.ndarray, seed: int) -> RadarFrame:
         """What the radar sees of the objects of a frame.

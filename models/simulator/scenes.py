@@ -10,6 +10,7 @@ import numpy as np
 
 from ...kernels.device import resolve_device
 from ...kernels.raycast import LidarCast
+from .arguments import check_numbers, check_whole
 from .ego import mounting
 from .frame import SimulatedFrame
 from .furnishing import clutter, furnish, grow, populate
@@ -106,12 +107,17 @@ def sample_scene(
         device: Where rays are cast.
 
     Raises:
-        ValueError: No such sensor.
+        TypeError: A number that is none.
+        ValueError: No such sensor, a seed or rain below 0, or a height that is not above it.
         DeviceError: No such device.
     """
+    check_whole(seed, "seed", 0)
+    check_numbers({"rain": rain}, from_0=("rain",))
+    if mounting_height is not None:
+        check_numbers({"mounting_height": mounting_height}, above_0=("mounting_height",))
     random = np.random.default_rng([seed, 11])
     drawn = _drawn_lidar(random)
-    model = lidar if isinstance(lidar, Lidar) else lidar_model(lidar) if lidar else drawn
+    model = drawn if lidar is None else lidar if isinstance(lidar, Lidar) else lidar_model(lidar)
     library, cast = _kept(model, rain, resolve_device(device))
     scene = _draw(random, mounting_height, turning)
     return observe(
@@ -133,7 +139,14 @@ def sample_views(
         count: How many.
         lidar: A sensor or its name; None draws one for each.
         device: Where rays are cast.
+
+    Raises:
+        TypeError: A number that is none.
+        ValueError: No such sensor, a seed below 0, or no sweep asked for.
+        DeviceError: No such device.
     """
+    check_whole(seed, "seed", 0)
+    check_whole(count, "count", 1)
     random = np.random.default_rng([seed, 11])
     drawn, device = _drawn_lidar(random), resolve_device(device)
     scene = _draw(random, None, False)
@@ -141,7 +154,7 @@ def sample_views(
     random = np.random.default_rng([seed, 12])
     pose_at = scene.pose_at
     for view in range(count):
-        model = lidar if isinstance(lidar, Lidar) else lidar_model(lidar) if lidar else drawn
+        model = drawn if lidar is None else lidar if isinstance(lidar, Lidar) else lidar_model(lidar)
         library, cast = _kept(model, 0.0, device)
         if world is None:
             world = World(scene.street, library)
@@ -203,10 +216,12 @@ class SceneBatch:
             device: Where rays are cast.
 
         Raises:
+            TypeError: `worlds` is no whole number.
             ValueError: Fewer than one world, or no such sensor.
             DeviceError: No such device.
         """
-        self.lidar = lidar_model(lidar) if isinstance(lidar, str) else lidar
+        check_whole(worlds, "worlds", 1)
+        self.lidar = lidar if isinstance(lidar, Lidar) else lidar_model(lidar)
         self.turning = turning
         self._library = Library(resolve_device(device), grounds=worlds)
         self._cast = caster(self._library, self.lidar, _PERIOD, worlds=worlds)
@@ -219,10 +234,13 @@ class SceneBatch:
             visibility: Whether to tell how much of each object can be seen.
 
         Raises:
-            ValueError: More seeds than worlds, or none.
+            TypeError: A seed that is no whole number.
+            ValueError: More seeds than worlds, none, or one below 0.
         """
         if not 0 < len(seeds) <= self._cast.worlds:
             raise ValueError(f"seeds must be 1 to {self._cast.worlds}, not {len(seeds)}")
+        for seed in seeds:
+            check_whole(seed, "seed", 0)
         turn = _PERIOD if self.turning else 0.0
         scenes: list[tuple[World, Callable[[float], np.ndarray], float]] = []
         for number in range(self._cast.worlds):

@@ -14,6 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
+from .arguments import check_numbers
+
 __all__ = ["LIDARS", "Lidar", "lidar_model"]
 
 
@@ -50,6 +52,22 @@ class Lidar:
     while a pulse of some 3 ns lasts."""
     azimuth_offset: np.ndarray | float = 0.0
     """Of each laser to the left of where the sensor faces [deg]; shape (lines,), or one for all."""
+
+    def __post_init__(self):
+        check_numbers(
+            self, above_0=("azimuth_step", "max_range", "reach"), shares=("drop_out",),
+            from_0=("min_range", "range_noise", "divergence", "pulse"),
+        )  # fmt: skip
+        if np.ndim(self.elevation) != 1 or len(self.elevation) == 0 or not np.isfinite(self.elevation).all():
+            raise ValueError(f"elevation must be finite, of shape (lines,), not {self.elevation!r}")
+        if np.shape(self.azimuth_offset) not in ((), (self.lines,)) or not np.isfinite(self.azimuth_offset).all():
+            raise ValueError(
+                f"azimuth_offset must be finite, one for all or ({self.lines},), not {self.azimuth_offset!r}"
+            )
+        if self.azimuth_step > 360:
+            raise ValueError(f"azimuth_step must be at most 360 degrees, not {self.azimuth_step}")
+        if self.min_range >= self.max_range:
+            raise ValueError(f"min_range must be below max_range, {self.max_range}, not {self.min_range}")
 
     @property
     def lines(self) -> int:
@@ -169,7 +187,6 @@ def lidar_model(name: str) -> Lidar:
     Raises:
         ValueError: There is none; the message lists those there are.
     """
-    try:
-        return LIDARS[name]
-    except KeyError:
-        raise ValueError(f"lidar must be one of {', '.join(LIDARS)}, not {name!r}") from None
+    if not isinstance(name, str) or name not in LIDARS:
+        raise ValueError(f"lidar must be one of {', '.join(LIDARS)}, not {name!r}")
+    return LIDARS[name]

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ...kernels.device import resolve_device
+from .arguments import check_numbers, check_whole
 from .cameras import Camera, CameraFrame, CameraView
 from .ego import EgoPath, mounting
 from .ego_sensors import Gnss, GnssModel, Imu, ImuModel, WheelSpeed, WheelSpeedModel
@@ -58,17 +59,22 @@ class Simulator:
             device: Where rays are cast.
 
         Raises:
-            ValueError: No such scenario or sensor, a length of time that is not positive, or a polish below 0.
+            TypeError: A number that is none.
+            ValueError: No such scenario or sensor, a seed, rain or polish below 0, or another number not above it.
             DeviceError: No such device.
         """
-        for name, value in (("duration", duration), ("rate", rate), ("mounting_height", mounting_height)):
-            if not value > 0:
-                raise ValueError(f"{name} must be > 0, not {value}")
-        if not 0 <= polish < np.inf:
-            raise ValueError(f"polish must be a number from 0, not {polish}")
+        check_whole(seed, "seed", 0)
+        numbers = {
+            "duration": duration,
+            "rate": rate,
+            "mounting_height": mounting_height,
+            "rain": rain,
+            "polish": polish,
+        }
+        check_numbers(numbers, above_0=("duration", "rate", "mounting_height"), from_0=("rain", "polish"))
         self.seed, self.rate, self.duration, self.rain = seed, rate, duration, rain
         self.mounting_height, self.turning, self.visibility = mounting_height, turning, visibility
-        self.lidar = lidar_model(lidar) if isinstance(lidar, str) else lidar
+        self.lidar = lidar if isinstance(lidar, Lidar) else lidar_model(lidar)
         drive = build_drive(scenario, seed, duration)
         self.polish = polish
         self._ego = EgoPath(drive.street.ground, drive.lane, np.array(drive.motion), duration)
@@ -137,7 +143,10 @@ class Simulator:
 
         Raises:
             IndexError: There is no such frame.
+            ValueError: A delay that is not finite.
         """
+        if not np.isfinite(delay):
+            raise ValueError(f"delay must be a number of seconds, not {delay}")
         t = self.time(index) + delay
         with self._running:
             if camera not in self._views:
@@ -166,7 +175,11 @@ class Simulator:
         return (model or ImuModel()).measure(self.vehicle_pose, self.duration, self.seed)
 
     def gnss(self, model: GnssModel | None = None, *, outages: Sequence[tuple[float, float]] = ()) -> Gnss:
-        """The GNSS fixes of the whole drive but for `outages`, beginning and end [s]."""
+        """The GNSS fixes of the whole drive but for `outages`, beginning and end [s].
+
+        Raises:
+            ValueError: An outage that ends before it begins.
+        """
         return (model or GnssModel()).measure(self.vehicle_pose, self.duration, self.seed, outages=outages)
 
     def wheel_speed(self, model: WheelSpeedModel | None = None) -> WheelSpeed:

@@ -100,7 +100,7 @@ def test_the_same_image_twice_and_another_at_another_time(simulator, camera, vie
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"width": 0}, "width and height"), ({"field_of_view": 180.0}, "field_of_view"),
+    [({"width": 0}, "width must be at least 1"), ({"field_of_view": 180.0}, "field_of_view"),
      ({"lidar_from_body": np.eye(3)}, "lidar_from_body")],
 )  # fmt: skip
 def test_cameras_that_cannot_be_are_refused(options, message):

@@ -118,5 +118,5 @@ def test_wheels_tell_the_speed_within_their_errors(drive):
 def test_the_same_seed_gives_the_same_measurements(drive):
     assert drive.imu().acceleration.tobytes() == drive.imu().acceleration.tobytes()
     assert drive.gnss().latitude.tobytes() == drive.gnss().latitude.tobytes()
-    with pytest.raises(ValueError, match="duration and rate"):
+    with pytest.raises(ValueError, match="rate must be a number above 0"):
         ImuModel(rate=0.0).measure(drive.vehicle_pose, 1.0, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warploom.models.classes import VEHICLE
-from warploom.models.simulator import PointClass, SceneBatch, Simulator, sample_scene
+from warploom.models.simulator import PointClass, SceneBatch, Simulator, sample_scene, sample_views
 from warploom.models.simulator.scenes import _draw
 
 
@@ -30,8 +30,33 @@ def test_sizes_of_a_batch_are_checked():
     batch = SceneBatch(1, lidar="vlp16")
     with pytest.raises(ValueError, match="seeds must be 1 to 1, not 2"):
         batch.frames([1, 2])
+    with pytest.raises(ValueError, match="seed must be at least 0, not -1"):
+        batch.frames([-1])
+    with pytest.raises(TypeError, match="seed must be a whole number"):
+        batch.frames([1.5])
     with pytest.raises(ValueError, match="worlds"):
         SceneBatch(0)
+    with pytest.raises(TypeError, match="worlds must be a whole number"):
+        SceneBatch(1.5)
+    with pytest.raises(ValueError, match="lidar must be one of"):
+        SceneBatch(1, lidar=None)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"seed": -1}, "seed must be at least 0"), ({"lidar": ""}, "lidar must be one of"), ({"rain": np.nan}, "rain"),
+     ({"mounting_height": 0}, "mounting_height must be a number above 0"), ({"mounting_height": np.nan}, "mounting_h")],
+)  # fmt: skip
+def test_scenes_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        sample_scene(**{"seed": 1, "lidar": "vlp16"} | options)
+
+
+def test_views_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="seed must be at least 0"):
+        sample_views(-1, 1)
+    with pytest.raises(ValueError, match="count must be at least 1, not 0"):
+        sample_views(1, 0)
 
 
 def test_the_ego_vehicle_of_a_turning_scene_drives():

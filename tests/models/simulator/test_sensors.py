@@ -1,10 +1,13 @@
 """The sensors' tables and the order in which they fire."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import yaml
 
-from warploom.models.simulator.sensors import LIDARS, lidar_model
+from warploom.models.simulator import Camera, CameraDetector, GnssModel, ImuModel, Radar, WheelSpeedModel
+from warploom.models.simulator.sensors import LIDARS, Lidar, lidar_model
 
 
 @pytest.mark.parametrize("name", list(LIDARS))
@@ -75,3 +78,39 @@ def test_the_hdl64_has_two_blocks():
 def test_an_unknown_sensor_is_refused_with_those_there_are():
     with pytest.raises(ValueError, match="vlp16"):
         lidar_model("none")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"elevation": np.zeros(0)}, "elevation must be finite, of shape"), ({"elevation": [np.nan]}, "elevation must"),
+        ({"azimuth_step": 0}, "azimuth_step must be a number above 0"), ({"azimuth_step": 400}, "at most 360"),
+        ({"azimuth_offset": np.zeros(3)}, "azimuth_offset must be"), ({"min_range": -1}, "min_range must be"),
+        ({"max_range": 0.5}, "min_range must be below max_range"), ({"reach": np.nan}, "reach must be"),
+        ({"range_noise": -1}, "range_noise"), ({"drop_out": 2}, "drop_out must be a number from 0 to 1, not 2"),
+        ({"divergence": -1}, "divergence must be"), ({"pulse": np.inf}, "pulse must be"),
+    ],
+)  # fmt: skip
+def test_sensors_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        Lidar(**{"name": "own", "elevation": np.linspace(-10, 10, 4), "azimuth_step": 1.0} | options)
+
+
+@pytest.mark.parametrize("made", [Camera, CameraDetector, GnssModel, ImuModel, Radar, WheelSpeedModel])
+def test_no_model_takes_a_number_that_is_none(made):
+    """Every number of each: neither nan nor below 0, nor a word."""
+    numbers = [field.name for field in fields(made) if isinstance(field.default, int | float)]
+    assert len(numbers) > 3
+    for name in numbers:
+        for value in (np.nan, -1, "many"):
+            with pytest.raises((TypeError, ValueError), match=f"{name} must be"):
+                made(**{name: value})
+
+
+@pytest.mark.parametrize(("made", "name"), [(Camera, "lidar_from_body"), (Radar, "lidar_from_radar")])
+def test_poses_of_sensors_are_rigid(made, name):
+    for pose in (np.full((4, 4), np.nan), np.zeros((4, 4)), 2 * np.eye(4)):
+        with pytest.raises(ValueError, match=f"{name} must be a rigid motion"):
+            made(**{name: pose})
+    with pytest.raises(ValueError, match=rf"{name} must have shape \(4, 4\), not \(\)"):
+        made(**{name: None})

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from warploom.models.classes import CLASSES, PEDESTRIAN, VEHICLE
-from warploom.models.simulator import LIDARS, PointClass, SimulatedFrame, Simulator, lidar_model, sample_scene
+from warploom.models.simulator import LIDARS, Camera, PointClass, SimulatedFrame, Simulator, lidar_model, sample_scene
 
 OBJECT_CLASSES = (
     PointClass.VEHICLE, PointClass.PEDESTRIAN, PointClass.CYCLIST, PointClass.CONE, PointClass.BARRIER,
@@ -174,12 +174,28 @@ def test_a_sensor_object_does_as_well_as_its_name():
     ("options", "message"),
     [
         ({"scenario": "moon"}, "scenario"), ({"lidar": "abacus"}, "lidar"), ({"duration": 0}, "duration"),
-        ({"rate": -1}, "rate"), ({"mounting_height": 0}, "mounting_height"),
+        ({"rate": -1}, "rate"), ({"mounting_height": 0}, "mounting_height"), ({"seed": -1}, "seed must be at least 0"),
+        ({"duration": np.inf}, "duration"), ({"rate": np.inf}, "rate"), ({"mounting_height": np.inf}, "mounting_h"),
+        ({"rain": -1}, "rain must be a number from 0 on"), ({"polish": np.nan}, "polish"), ({"lidar": None}, "lidar"),
+        ({"lidar": 64}, "lidar must be one of vlp16"), ({"scenario": None}, "scenario"),
     ],
 )  # fmt: skip
 def test_wrong_arguments_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         Simulator(**options)
+
+
+@pytest.mark.parametrize("name", ["seed", "duration", "rate", "mounting_height", "rain", "polish"])
+def test_what_is_no_number_is_named(name):
+    with pytest.raises(TypeError, match=f"{name} must be a (whole )?number, not 'many'"):
+        Simulator(**{name: "many"})
+
+
+def test_what_a_drive_cannot_give_is_named(drive):
+    with pytest.raises(ValueError, match="delay must be a number of seconds, not nan"):
+        drive.image(0, Camera(), delay=np.nan)
+    with pytest.raises(ValueError, match="outages must be pairs of a beginning and an end not before it"):
+        drive.gnss(outages=[(2.0, 1.0)])
 
 
 def test_a_frame_that_is_not_there(drive):
