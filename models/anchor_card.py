@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from .card import LidarCard
+from .card import MOST_BOXES, CardPart, LidarCard
 
 __all__ = ["AnchorCard", "AnchorSpec", "PillarSpec", "ReadSpec"]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class PillarSpec(_Strict):
+class PillarSpec(CardPart):
     """How points become pillars: the first points of each in the order of the cloud, zero-padded."""
 
     point_range: tuple[float, float, float, float, float, float]
     """xmin ymin zmin xmax ymax zmax in the sensor's frame [m], upper bounds open."""
     pillar: tuple[float, float, float]
     """Edges along x y z [m]."""
-    max_points: int = Field(32, ge=1)
+    max_points: int = Field(32, ge=1, le=1024)
     """That a pillar keeps."""
-    max_pillars: int = Field(40_000, ge=1)
+    max_pillars: int = Field(40_000, ge=1, le=1 << 20)
     features: Literal[3, 4] = 4
     """Columns of a point: x y z, and intensity in [0, 1]."""
     sensor_height: float = 1.73
@@ -38,7 +34,7 @@ class PillarSpec(_Strict):
         return columns, rows
 
 
-class AnchorSpec(_Strict):
+class AnchorSpec(CardPart):
     """The anchors of one class."""
 
     size: tuple[float, float, float]
@@ -49,7 +45,7 @@ class AnchorSpec(_Strict):
     """[rad]"""
 
 
-class ReadSpec(_Strict):
+class ReadSpec(CardPart):
     """From maps to boxes."""
 
     stride: int = Field(2, ge=1)
@@ -62,8 +58,8 @@ class ReadSpec(_Strict):
     nms_iou: float = Field(0.01, gt=0, le=1)
     each_class: bool = False
     """Whether classes are suppressed each by itself, and an anchor may be of several (mmdetection3d's way)."""
-    max_candidates: int = Field(4096, ge=1)
-    max_objects: int = Field(500, ge=1)
+    max_candidates: int = Field(4096, ge=1, le=MOST_BOXES)
+    max_objects: int = Field(500, ge=1, le=MOST_BOXES)
 
 
 class AnchorCard(LidarCard):
@@ -115,6 +111,8 @@ class AnchorCard(LidarCard):
         """What in it does not fit together."""
         if len(self.anchors) != len(self.classes):
             return f"anchors are of {len(self.anchors)} classes, but there are {len(self.classes)}: name each"
+        if not all(anchor.yaws and min(anchor.size) > 0 for anchor in self.anchors):
+            return "anchors must each have a size above 0 and one yaw or more"
         low, high = self.pillars.point_range[:3], self.pillars.point_range[3:]
         if not all(a < b for a, b in zip(low, high, strict=True)) or min(self.pillars.pillar) <= 0:
             return "pillars.point_range must have min < max, and pillars.pillar must be > 0"

@@ -20,6 +20,8 @@ from .onnx_file import NotOnnxError, external_data, opset
 __all__ = [
     "DEFAULT_CARD",
     "EIGHT_BITS_CARD",
+    "MOST_BOXES",
+    "CardPart",
     "DecodeSpec",
     "HeadCard",
     "InputSpec",
@@ -53,11 +55,17 @@ def _name_of_file(value: str) -> str:
     return value
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+MOST_BOXES = 1 << 15
+"""That a card may ask room for: suppression compares each of them with each."""
 
 
-class InputSpec(_Strict):
+class CardPart(BaseModel):
+    """What has no keys but its own, and no numbers but finite ones."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class InputSpec(CardPart):
     """The model's one input: pillars, as `kernels.pillar.PillarGrid` makes them."""
 
     name: str
@@ -71,7 +79,7 @@ class InputSpec(_Strict):
     """Edge of a cell [m]."""
 
 
-class OutputSpec(_Strict):
+class OutputSpec(CardPart):
     """The model's one output: heat maps of the classes (logits), then the box at each cell."""
 
     name: str
@@ -101,7 +109,7 @@ class OutputSpec(_Strict):
         return value
 
 
-class DecodeSpec(_Strict):
+class DecodeSpec(CardPart):
     """From maps to boxes."""
 
     stride: int = Field(ge=1)
@@ -113,11 +121,11 @@ class DecodeSpec(_Strict):
     """Share of the thought overlap in a score."""
     refine: tuple[str, ...] = ()
     """Classes whose boxes are turned and moved onto their points, see `kernels.box_refine`."""
-    max_candidates: int = Field(ge=1)
-    max_objects: int = Field(ge=1)
+    max_candidates: int = Field(ge=1, le=MOST_BOXES)
+    max_objects: int = Field(ge=1, le=MOST_BOXES)
 
 
-class SecondSpec(_Strict):
+class SecondSpec(CardPart):
     """The second stage: a network that looks at the points of the first one's boxes, see `models.second_stage`."""
 
     file: str
@@ -172,7 +180,7 @@ class SecondSpec(_Strict):
         return value
 
 
-class ModelCard(_Strict):
+class ModelCard(CardPart):
     """What every card says, whatever its network takes and gives."""
 
     name: str
@@ -223,6 +231,8 @@ class HeadCard(LidarCard):
     def contradiction(self) -> str:
         """What in it does not fit together."""
         spec, low, high = self.input, self.input.point_range[:3], self.input.point_range[3:]
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            return f"input.point_range must be xmin ymin zmin xmax ymax zmax with min < max, not {spec.point_range}"
         columns, rows = (round((high[axis] - low[axis]) / spec.cell) for axis in (0, 1))
         wanted_in = (1, len(spec.channels), rows, columns)
         if spec.shape != wanted_in:

@@ -60,9 +60,9 @@ def card_kind(path: str | Path) -> str:
     """
     content = read_card_file(named_card(path))
     kind = content.get("kind", "pillar_center") if isinstance(content, dict) else None
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise ModelError(f"{path}: a card of the kind {kind!r}; there are: {', '.join(KINDS)}")
-    return str(kind)
+    return kind
 
 
 def _named(module: str, name: str) -> Any:

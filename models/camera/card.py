@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from ..card import ModelCard
+from ..card import MOST_BOXES, CardPart, ModelCard
 
 __all__ = ["BoxReadSpec", "ImageDetectorCard", "ImageSpec", "MaskCard", "TensorName"]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ImageSpec(_Strict):
+class ImageSpec(CardPart):
     """The network's input, and how an image becomes it."""
 
     name: str
-    shape: tuple[Literal[1], Literal[3], int, int]
+    shape: tuple[Literal[1], Literal[3], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
     """1, 3, height, width [pixels]."""
     order: Literal["bgr", "rgb"] = "bgr"
     scale: float = Field(1.0, gt=0)
@@ -30,23 +26,23 @@ class ImageSpec(_Strict):
     """What a letterbox is filled up with."""
 
 
-class TensorName(_Strict):
+class TensorName(CardPart):
     """An output of the network."""
 
     name: str
     shape: tuple[int, ...]
 
 
-class BoxReadSpec(_Strict):
+class BoxReadSpec(CardPart):
     """From the output to boxes."""
 
     score_threshold: float = Field(ge=0, le=1)
     nms_iou: float = Field(gt=0, le=1)
     each_class: bool = False
     """Whether classes are suppressed each by itself."""
-    strides: tuple[int, ...] = (8, 16, 32)
+    strides: tuple[Annotated[int, Field(ge=1)], ...] = (8, 16, 32)
     """Pixels between neighbouring cells of the grids, in the order of the output."""
-    max_objects: int = Field(200, ge=1)
+    max_objects: int = Field(200, ge=1, le=MOST_BOXES)
 
 
 class ImageDetectorCard(ModelCard):
@@ -85,6 +81,8 @@ class MaskCard(ModelCard):
     def contradiction(self) -> str:
         """What in it does not fit together."""
         wanted = (1, 2, *self.input.shape[2:])
+        if self.input.fit != "stretch":
+            return f"masks are of whole images: input.fit must be stretch, not {self.input.fit}"
         if len(self.outputs) != len(self.classes):
             return f"there are {len(self.outputs)} outputs, but {len(self.classes)} classes"
         for output in self.outputs:

@@ -61,8 +61,6 @@ class MaskHead:
         self.card, model = load_card(card, MaskCard)
         self.device = resolve_device(device)
         spec = self.card.input
-        if spec.fit != "stretch":
-            raise ValueError(f"{card}: masks are of whole images: input.fit must be stretch, not {spec.fit}")
         self._network = Network(
             model,
             {spec.name: spec.shape},

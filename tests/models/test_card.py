@@ -70,6 +70,12 @@ def test_a_missing_model_and_a_missing_card_are_named(card_path):
         ({"opset": 16}, "its opset is 17, but the card"),
         ({"opset": 18}, "opset"),
         ({"decode__nms_iou": 2.0}, "decode.nms_iou"),
+        (
+            {"input__point_range": [-8, -4, -2, 8, 4, float("inf")]},
+            "input.point_range.5: Input should be a finite number",
+        ),
+        ({"input__point_range": [-8, -4, 6, 8, 4, -2]}, "input.point_range must be .* with min < max"),
+        ({"decode__max_candidates": 10**9}, "decode.max_candidates: Input should be less than or equal to 32768"),
         ({"decode__overlap_weight": 0.5}, "overlap_weight is 0.5, but output.regression has no iou"),
         ({"decode__overlap_weight": 1.0}, "decode.overlap_weight"),
         ({"decode__refine": ["unicorn"]}, "decode.refine names unicorn, but the classes are vehicle"),

@@ -24,7 +24,8 @@ def test_a_card_without_a_kind_is_of_a_pillar_centre_head():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("kind: oracle", "a card of the kind 'oracle'; there are: pillar_center"), ("- 1", "a card of the kind None"),
+    [("kind: [masks]", r"a card of the kind \['masks'\]; there are"),
+     ("kind: oracle", "a card of the kind 'oracle'; there are: pillar_center"), ("- 1", "a card of the kind None"),
      ("kind: [", "the card is not YAML")],
 )  # fmt: skip
 def test_what_is_no_card_is_refused(text, message, tmp_path):

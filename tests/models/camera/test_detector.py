@@ -188,6 +188,9 @@ def test_a_card_of_other_classes_is_refused(small_head):
     small_head.write_text(text.replace("- c\n", ""))
     with pytest.raises(ModelError, match=r"output.shape \(1, 84, 8\) does not follow from input, strides and classes"):
         ImageDetector(small_head)
+    small_head.write_text(re.sub(r"strides:\n *- 8", "strides:\\n  - 0", text))
+    with pytest.raises(ModelError, match=r"read\.strides\.0: Input should be greater than or equal to 1"):
+        ImageDetector(small_head)
 
 
 @pytest.mark.parametrize("cut", [0, 50, 900])

@@ -151,3 +151,6 @@ def test_a_card_of_other_outputs_is_refused(random_card):
     card.write_text(text.replace("- drivable_area\n- lane\n", "- lane\n- drivable_area\n"))
     with pytest.raises(ModelError, match="its classes are drivable_area,lane, but the card says lane,drivable_area"):
         MaskHead(card)
+    card.write_text(text.replace("fit: stretch", "fit: letterbox"))
+    with pytest.raises(ModelError, match=r"other\.yaml: masks are of whole images: input\.fit must be stretch"):
+        MaskHead(card)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
+import yaml
 from torch import nn
 from torch.nn import functional
 
@@ -310,6 +311,35 @@ def test_the_card_says_what_the_head_needs(tmp_path):
     assert card.classes == ("vehicle", "pedestrian", "cyclist")
     assert card.shape == (32, 32)
     assert card.training["framework"] == "OpenPCDet"
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (("pillars", "point_range"), [0, -4, float("nan"), 8, 4, 1], "point_range.2: Input should be a finite number"),
+        (("pillars", "pillar"), [0.16, 0.0, 4], "pillars.pillar must be > 0"),
+        (("pillars", "max_pillars"), 10**9, "pillars.max_pillars: Input should be less than or equal to"),
+        (("anchors", 0, "size"), [0, 1, 1], "anchors must each have a size above 0"),
+        (("anchors", 1, "yaws"), [], "anchors must each have .* one yaw or more"),
+        (
+            ("classes",),
+            ["vehicle", "cyclist", "pedestrian"],
+            "its classes are vehicle,pedestrian,cyclist, but the card",
+        ),
+        (("read", "stride"), 3, "read.stride 3 does not divide the grid"),
+        (("opset",), 16, "its opset is 17, but the card"),
+    ],
+)
+def test_a_card_that_does_not_fit_is_refused(where, value, message, tmp_path):
+    path, _ = saved(tmp_path, "openpcdet")
+    card = import_pointpillars(path, tmp_path, spec=spec())
+    content = part = yaml.safe_load(card.read_text())
+    for key in where[:-1]:
+        part = part[key]
+    part[where[-1]] = value
+    card.write_text(yaml.safe_dump(content))
+    with pytest.raises(ModelError, match=message):
+        AnchorHead(card)
 
 
 class Evil:
