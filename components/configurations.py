@@ -37,7 +37,7 @@ class NamedFile:
         try:
             text = self.path.read_text(encoding="utf-8")
             content = yaml.safe_load(text)
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
             return f"cannot be read: {type(error).__name__}"
         told = content.get("description") if isinstance(content, dict) else None
         comment = itertools.takewhile(lambda line: line.startswith("#"), text.splitlines())

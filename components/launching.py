@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -125,7 +126,7 @@ def _profile(
         beside = file.path.parent / wanted
         try:
             return load_profile(
-                str(beside) if beside.suffix in (".yaml", ".yml") and beside.is_file() else wanted, changes
+                str(beside) if beside.suffix in (".yaml", ".yml") and os.path.isfile(beside) else wanted, changes
             )
         except ConfigError as error:
             raise file.error(["profile"], str(error)) from None

@@ -23,6 +23,7 @@ M = TypeVar("M", bound=BaseModel)
 Expand = Callable[[dict[str, Any]], tuple[dict[str, Any], Mapping[tuple[str | int, ...], str | int]]]
 
 _FAST_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEPTH = 100
 _ENVIRONMENT_PREFIX = "WARPLOOM__"
 
 
@@ -45,11 +46,27 @@ def _read(text: str) -> tuple[yaml.Node | None, Any]:
     Raises:
         YAMLError: It is none.
     """
+    # libyaml is ten times as fast, but says less of a mistake.
     try:
-        # libyaml is ten times as fast, but says less of a mistake.
-        return yaml.compose(text, Loader=_FAST_LOADER), yaml.load(text, Loader=_FAST_LOADER)
+        too_deep = _nested_too_deep(text)
+        if too_deep is None:
+            return yaml.compose(text, Loader=_FAST_LOADER), yaml.load(text, Loader=_FAST_LOADER)
     except yaml.YAMLError:
         return yaml.compose(text, Loader=yaml.SafeLoader), yaml.safe_load(text)
+    raise yaml.MarkedYAMLError(problem=f"more than {_DEPTH} levels in each other", problem_mark=too_deep)
+
+
+def _nested_too_deep(text: str) -> yaml.Mark | None:
+    """Where a text has too many levels, of which libyaml's recursion would end the process; None: nowhere."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_FAST_LOADER):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > _DEPTH:
+                return event.start_mark
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+    return None
 
 
 def _unique_keys(node: yaml.Node | None, path: Path, visited: set[int]) -> None:
@@ -283,14 +300,14 @@ def find_config(name: str, kind: str, shipped: Path) -> Path:
         ConfigError: It is nowhere; the message lists the names that are.
     """
     direct = Path(name)
-    if direct.suffix in (".yaml", ".yml") and direct.is_file():
+    if direct.suffix in (".yaml", ".yml") and os.path.isfile(direct):  # false also of what can name no file
         return direct
     own = os.environ.get("WARPLOOM_CONF")
     folders = [Path("conf"), *([Path(own)] if own else []), shipped]
     file_name = name if direct.suffix in (".yaml", ".yml") else f"{name}.yaml"
     for folder in folders:
         candidate = folder / kind / file_name
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return candidate
     names = {path.stem for folder in folders for path in (folder / kind).glob("*.yaml")}
     raise ConfigError(f"no {kind.removesuffix('s')} {name!r}: neither a file nor a name; {nearest(name, names)}")

@@ -31,7 +31,7 @@ class YamlFlags:
         """
         try:
             flags = yaml.safe_load(self._path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
             raise ConfigError(f"{self._path}: flags cannot be read: {error}") from error
         if not isinstance(flags, dict):
             raise ConfigError(f"{self._path}:1: expected a mapping of flags to values, found {type(flags).__name__}")

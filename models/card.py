@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar, get_args, overload
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
@@ -35,6 +35,7 @@ __all__ = [
     "named_card",
     "read_card_file",
     "read_yaml",
+    "said_errors",
     "save_card",
 ]
 
@@ -291,6 +292,11 @@ def named_card(card: str | Path) -> Path:
     return Path(card) if Path(card).is_file() else ships.get(str(card), Path(card))
 
 
+def said_errors(error: ValidationError) -> str:
+    """Keys of a card that are not valid, and why, in one line."""
+    return "; ".join(f"{'.'.join(map(str, each['loc'])) or 'card'}: {each['msg']}" for each in error.errors())
+
+
 def file_sha256(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as file:
@@ -353,11 +359,14 @@ def load_card(path: str | Path, kind: type[ModelCard] = HeadCard) -> tuple[Model
     """
     path = named_card(path)
     content = read_card_file(path)
+    kinds = get_args(kind.model_fields["kind"].annotation)
+    said = content.get("kind", kinds[0]) if isinstance(content, dict) else kinds[0]
+    if said not in kinds:
+        raise ModelError(f"{path}: a card of the kind {said!r}; one of the kind {' or '.join(kinds)} is wanted here")
     try:
         card = kind.model_validate(content)
     except ValidationError as error:
-        reasons = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'card'}: {e['msg']}" for e in error.errors())
-        raise ModelError(f"{path}: the card is not valid: {reasons}") from error
+        raise ModelError(f"{path}: the card is not valid: {said_errors(error)}") from error
     if contradiction := card.contradiction():
         raise ModelError(f"{path}: {contradiction}")
     _check_model(path, card.file, card.sha256, card.opset)

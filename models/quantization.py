@@ -73,7 +73,8 @@ def quantize_head(
         The path of the new card.
 
     Raises:
-        ModelError: The card or its model is missing or not valid, or the onnx package is not there.
+        ModelError: The card or its model is missing or not valid, is in eight bits already, or the onnx package is not
+            there.
     """
     try:
         import onnx
@@ -84,6 +85,8 @@ def quantize_head(
             "to quantise a head takes onnx, which is not installed: pip install 'warploom[torch]'"
         ) from error
     old, model = load_card(card)
+    if any(node.op_type == "DequantizeLinear" for node in onnx.load(str(model)).graph.node):
+        raise ModelError(f"{model}: it is in eight bits already; take the card that it was made of")
     grid = PillarGrid(
         point_range=old.input.point_range,
         cell=old.input.cell,

@@ -55,7 +55,7 @@ def find_launch_file(name: str, shipped: Path) -> Path:
     """
     direct = Path(name)
     if direct.suffix in (".yaml", ".yml", ".xml"):
-        if direct.is_file():
+        if os.path.isfile(direct):
             return direct
         if direct.name != name:
             raise ConfigError(f"{direct}: there is no such file")
@@ -111,7 +111,7 @@ def _header(path: Path) -> HardwareSpec | None:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
         hardware = data.get("hardware") if isinstance(data, dict) else None
         return None if hardware is None else HardwareSpec.model_validate(hardware)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError) as error:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: {str(error).splitlines()[0]}") from error
 
 

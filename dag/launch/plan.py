@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,7 +101,7 @@ def plan_modules(
 def _module_path(beside: Path, name: str, shipped: Path) -> Path:
     """A module file: beside the launch file, or wherever configuration lies."""
     path = beside / name
-    if path.suffix in (".yaml", ".yml") and path.is_file():
+    if path.suffix in (".yaml", ".yml") and os.path.isfile(path):
         return path
     try:
         return find_config(name, "modules", shipped)

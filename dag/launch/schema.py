@@ -25,6 +25,14 @@ def _is_name(name: str) -> str:
 class _Spec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _is_not_a_flag(cls, value: Any) -> Any:
+        for one in value if isinstance(value, list) else [value]:
+            if isinstance(one, bool):  # else it would count as 0 or 1; nothing here is on or off
+                raise ValueError(f"expected no {str(one).lower()}")
+        return value
+
 
 class HardwareSpec(_Spec):
     """The hardware that a launch file is for; it is found by these."""
@@ -105,7 +113,7 @@ class ProcessSpec(_Spec):
     """Unique in the node."""
     type: Literal["warploom"] = "warploom"
     process_name: str = ""
-    """What the system shows as its name; by default `name`."""
+    """What the system shows as its name, of which it keeps 15 bytes; by default `name`."""
     modules: list[str] = Field(min_length=1)
     """Module files: paths from the launch file's folder, or names."""
     cgroup: str | None = None
@@ -136,6 +144,13 @@ class ProcessSpec(_Spec):
         """The control group that it is put into; None: it stays in the supervisor's."""
         return self.cgroup or (self.name if self.limits != LimitsSpec() else None)
 
+    @field_validator("process_name")
+    @classmethod
+    def _is_shown(cls, name: str) -> str:
+        if not name.isprintable():
+            raise ValueError(f"expected a name that can be shown, not {name!r}")
+        return name
+
     @field_validator("type", mode="before")
     @classmethod
     def _reference_type(cls, value: Any) -> Any:
@@ -165,6 +180,8 @@ class ProcessSpec(_Spec):
                     raise ValueError(f"the name of a variable is a text without '=', not {key!r}")
                 if isinstance(value, bool) or not isinstance(value, (str, int, float)):
                     raise ValueError(f"{key} must be a text or a number, not {value!r}: put it in quotes")
+                if "\0" in str(value):
+                    raise ValueError(f"{key} must not have a character 0 in it: {value!r}")
             return {key: str(value) for key, value in environment.items()}
         return environment
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 __all__ = ["SharedMemoryConfig", "ZenohConfig"]
+
+_ENDPOINT = re.compile(r"[a-z0-9_-]+/[\x21-\x7e]+")
 
 
 class SharedMemoryConfig(BaseModel):
@@ -12,7 +16,7 @@ class SharedMemoryConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    memory_bytes: int = Field(1 << 32, ge=4096)
+    memory_bytes: int = Field(1 << 32, ge=4096, le=1 << 44)
     """Address space of a topic, a power of two; memory is taken as it is used [B]."""
     queue: int = Field(8, ge=1, le=128)
     """How many payloads a reader may have in its queue, beside those that its window keeps of two epochs."""
@@ -61,3 +65,11 @@ class ZenohConfig(BaseModel):
     counted."""
     history: bool = True
     """Whether a reader that comes later is given the newest datum."""
+
+    @field_validator("connect", "listen")
+    @classmethod
+    def _are_endpoints(cls, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+        for one in endpoints:
+            if not _ENDPOINT.fullmatch(one):
+                raise ValueError(f"expected an endpoint such as tcp/192.168.1.7:7447, not {one!r}")
+        return endpoints

@@ -42,7 +42,7 @@ def read_state_dict(path: str | Path) -> dict[str, torch.Tensor]:
     except FileNotFoundError as error:
         raise ModelError(f"{path}: no such checkpoint") from error
     except Exception as error:  # pickle, zip and torch each have errors of their own
-        reason = str(error).partition("\n")[0]
+        reason = str(error).partition("\n")[0] or type(error).__name__
         raise ModelError(
             f"{path}: it is no checkpoint of plain tensors: {reason}; save its state dict alone: "
             "torch.save(model.state_dict(), …)"
@@ -82,7 +82,8 @@ def load_tensors(network: torch.nn.Module, tensors: Mapping[str, torch.Tensor], 
             raise shape_error(path, name, tensors[name].shape, value.shape)
         if not bool(torch.isfinite(tensors[name].float()).all()):
             raise ModelError(f"{path}: {name} has numbers that are not finite")
-    network.load_state_dict({name: tensors.get(name, value) for name, value in own.items()})
+    # How many batches were seen is of no use; frameworks leave it out, or have it in shapes of their own.
+    network.load_state_dict(own | {name: tensors[name] for name in own if name not in counts})
     network.eval()
 
 

@@ -13,16 +13,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch  # noqa: TID253 (nothing but an import loads this module)
 import yaml
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from torch import nn  # noqa: TID253
 
 from ...errors import ModelError
 from ..anchor_card import AnchorCard, AnchorSpec, PillarSpec, ReadSpec
+from ..card import said_errors
 from .checkpoint import load_tensors, read_state_dict, shape_error, write_head
 
 __all__ = ["PointPillarsNet", "PointPillarsSpec", "import_pointpillars"]
@@ -62,23 +62,13 @@ class PointPillarsSpec:
             content = yaml.safe_load(Path(path).read_text("utf-8")) or {}
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise ModelError(f"{path}: cannot read the configuration: {error}") from error
-        known = {name: field_.type for name, field_ in cls.__dataclass_fields__.items()}
+        known = cls.__dataclass_fields__
         if not isinstance(content, Mapping) or set(content) - set(known):
             raise ModelError(f"{path}: expected some of {', '.join(known)}, got {content!r}")
         try:
-            values: dict[str, Any] = dict(content)
-            if "pillars" in values:
-                values["pillars"] = PillarSpec(**values["pillars"])
-            if "read" in values:
-                values["read"] = ReadSpec(**values["read"])
-            if "anchors" in values:
-                values["anchors"] = tuple(AnchorSpec(**each) for each in values["anchors"])
-            for name in ("classes", "strides"):
-                if name in values:
-                    values[name] = tuple(values[name])
-            return cls(**values)
-        except (TypeError, ValidationError) as error:
-            raise ModelError(f"{path}: {error}") from error
+            return TypeAdapter(cls).validate_python(dict(content))
+        except ValidationError as error:
+            raise ModelError(f"{path}: {said_errors(error)}") from error
 
 
 class _PillarFeatures(nn.Module):

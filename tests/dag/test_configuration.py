@@ -158,6 +158,9 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, write):
     with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
         ConfigFile(tmp_path, Profile)
     path = write("")
+    for deep in (101 * "[" + 101 * "]", 200_000 * "[", 200_000 * "- "):
+        with pytest.raises(ConfigError, match=r"module\.yaml:2: is not YAML: more than 100 levels in each other"):
+            ConfigFile(write("name:\n " + deep), Profile)
     path.write_bytes(b"name: \xff\xfe")
     with pytest.raises(ConfigError, match=r"module\.yaml: is not UTF-8 text"):
         ConfigFile(path, Profile)
@@ -277,6 +280,9 @@ def test_a_name_that_is_nowhere_is_told_with_those_that_are(places):
     places("own", "cpu-min.yaml")
     with pytest.raises(ConfigError, match=r"no profile 'cpo': .*did you mean 'cpu'\? known: cpu, cpu-min"):
         find_config("cpo", "profiles", Path("shipped"))
+    for long in (5000 * "a", 5000 * "a" + ".yaml", "a\0b", "a\0b.yaml"):
+        with pytest.raises(ConfigError, match="neither a file nor a name"):
+            find_config(long, "profiles", Path("shipped"))
 
 
 def test_the_environment_need_not_name_a_folder(places, monkeypatch):

@@ -81,6 +81,7 @@ def test_a_missing_model_and_a_missing_card_are_named(card_path):
         ({"decode__refine": ["unicorn"]}, "decode.refine names unicorn, but the classes are vehicle"),
         ({"output__regression": ["dx", "dy"]}, "this version decodes dx, dy"),
         ({"surprise": 1}, "surprise"),
+        ({"kind": "unicorn"}, "a card of the kind 'unicorn'; one of the kind .*pillar_center.* is wanted here"),
         ({"sha256": "abc"}, "sha256"),
         ({"file": "../pillar_center.onnx"}, "file: .*must be the name of a file beside the card"),
         ({"file": "/etc/passwd"}, "file: .*must be the name of a file beside the card"),
@@ -146,6 +147,13 @@ def test_a_model_cut_off_is_refused_though_its_card_means_it(card_path):
     edit(card_path, sha256=hashlib.sha256(model.read_bytes()).hexdigest())
     with pytest.raises(ModelError, match=r"pillar_center.onnx: this is not an ONNX model"):
         load_card(card_path)
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "just text"])
+def test_what_is_no_mapping_is_refused(text, tmp_path):
+    (tmp_path / "card.yaml").write_text(text)
+    with pytest.raises(ModelError, match=r"card.yaml: the card is not valid: card: Input should be a valid dictionary"):
+        load_card(tmp_path / "card.yaml")
 
 
 def test_what_is_not_yaml_is_refused(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from warploom.errors import ModelError
 from warploom.models.card import load_card
 from warploom.models.head import DetectionHead
 from warploom.models.quantization import quantize_head
@@ -47,6 +48,11 @@ def test_it_says_nearly_the_same(cards, clouds):
         maps.append(head._maps.numpy().copy())
     assert np.abs(maps[1] - maps[0]).mean() < 0.05 * maps[0].std()
     assert not np.array_equal(maps[0], maps[1])
+
+
+def test_eight_bits_are_not_quantised_again(cards, clouds, tmp_path):
+    with pytest.raises(ModelError, match="it is in eight bits already; take the card that it was made of"):
+        quantize_head(cards[1], tmp_path, [(clouds[0], 1.7)])
 
 
 def test_a_second_stage_goes_with_it(cards, clouds, tmp_path):

@@ -52,6 +52,12 @@ def test_a_broken_file_does_not_hide_the_others_and_is_named(shipped):
         find_by_hardware({"hw": "none"}, shipped)
 
 
+def test_a_file_nested_too_deep_is_broken(shipped):
+    (shipped / "launch" / "broken.launch.yaml").write_text("hardware: " + 5000 * "[")
+    with pytest.raises(ConfigError, match=r"not readable: .*broken\.launch\.yaml"):
+        find_by_hardware({"hw": "none"}, shipped)
+
+
 def test_a_file_of_ones_own_covers_a_shipped_one_of_its_name(shipped, tmp_path):
     own = tmp_path / "conf" / "launch"
     own.mkdir(parents=True)
@@ -72,6 +78,9 @@ def test_a_name_that_is_none_is_told_with_the_nearest(shipped, tmp_path):
         find_launch_file("betta", shipped)
     with pytest.raises(ConfigError, match="there is no such file"):
         find_launch_file(str(tmp_path / "x.launch.yaml"), shipped)
+    for long in (5000 * "a", "a\0b", 5000 * "a" + ".launch.xml"):
+        with pytest.raises(ConfigError, match="no launch file '"):
+            find_launch_file(long, shipped)
 
 
 def test_two_processes_of_one_name_are_refused(tmp_path):

@@ -388,6 +388,21 @@ def test_other_networks_are_refused_by_name(change, message, tmp_path):
         import_pointpillars(path, tmp_path, spec=spec())
 
 
+@pytest.mark.parametrize("count", [None, torch.tensor([3]), torch.full((), 7)])
+def test_how_many_batches_were_seen_is_of_no_use(count, points, tmp_path):
+    """Frameworks leave it out, or keep it in a shape of their own."""
+    state = state_dict("openpcdet")
+    counts = [name for name in state if name.endswith("num_batches_tracked")]
+    assert counts
+    for name in counts:
+        state.pop(name)
+        if count is not None:
+            state[name] = count
+    path = tmp_path / "counted.pth"
+    torch.save(state, path)
+    load_card(import_pointpillars(path, tmp_path, spec=spec()), AnchorCard)
+
+
 def test_other_networks_of_torch_are_refused(tmp_path):
     path = tmp_path / "linear.pth"
     torch.save(nn.Linear(2, 2).state_dict(), path)
@@ -402,7 +417,8 @@ def test_a_configuration_file_says_what_differs_from_kitti(tmp_path):
     assert read.read.score_threshold == 0.2
     assert not read.absolute_places
     assert read.anchors == PointPillarsSpec().anchors
-    for text, message in (("reed: 1", "expected some of"), ("read: {stride: 0}", "stride"), ("[", "cannot read")):
+    for text, message in (("reed: 1", "expected some of"), ("read: {stride: 0}", "stride"), ("[", "cannot read"),
+                          ("anchors: 3", r"spec.yaml: anchors"), ("strides: [a]", r"strides.0")):  # fmt: skip
         path.write_text(text)
         with pytest.raises(ModelError, match=message):
             PointPillarsSpec.read_file(path)
