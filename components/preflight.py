@@ -5,6 +5,7 @@ Importing this registers the checks with the launcher.
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import math
 import os
@@ -13,7 +14,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs
+from urllib.parse import parse_qs, urlsplit
 
 from ..dag import ComponentSpec, ConfigFile, nearest
 from ..dag.launch.cgroup import ControlGroups
@@ -177,21 +178,24 @@ def check_ports(plan: LaunchPlan) -> Iterator[Finding]:
             continue
         asked[port] = who
         why = _cannot_listen(port)
-        yield Finding("ports", why is None, f"{who}: port {port} is {why or 'free'}", way_out if why else "")
+        yield Finding("ports", why is None, f"{who}: port {port} {why or 'is free'}", way_out if why else "")
 
 
-def _cannot_listen(port: int) -> str | None:
-    with socket.socket() as probe:
-        if os.name == "posix":
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except PermissionError:
-            return f"not permitted to this user (below {_first_free_port()} it needs CAP_NET_BIND_SERVICE)"
-        except OSError as error:
-            return f"taken: {error.strerror or error}"
-        except OverflowError:
-            return "no port: they go to 65535"
+def _cannot_listen(port: int, host: str = "127.0.0.1") -> str | None:
+    if not 0 <= port <= 65535:
+        return "is no port: they go to 65535"
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            if os.name == "posix":
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            probe.listen()  # of two that are bound so, only one can
+    except PermissionError:
+        return f"is not permitted to this user (below {_first_free_port()} it needs CAP_NET_BIND_SERVICE)"
+    except OSError as error:
+        taken = error.errno == errno.EADDRINUSE
+        return f"{'is taken' if taken else 'cannot be listened at'}: {error.strerror or error}"
     return None
 
 
@@ -320,6 +324,17 @@ def check_remote(plan: LaunchPlan) -> Iterator[Finding]:
         if topic not in known:
             message = f"no module of the node commits or reads topic {topic!r}; {nearest(topic, known)}"
             yield Finding("remote", False, message, f"correct it in remote of {plan.file.path}, or take it out")
+    for endpoint in plan.spec.zenoh.listen if remote else ():
+        protocol, _, address = endpoint.partition("/")
+        if protocol not in ("tcp", "tls", "ws"):  # the others are not held by being listened at
+            continue
+        try:
+            where = urlsplit(f"//{address}")
+            why = "has no port" if where.port is None else _cannot_listen(where.port, where.hostname or "")
+        except ValueError as error:
+            why = f"is no endpoint: {error}"
+        way_out = f"correct zenoh.listen of {plan.file.path}, or end what listens there"
+        yield Finding("remote", why is None, f"zenoh: {endpoint} {why or 'is free'}", way_out if why else "")
 
 
 def check_recordings(plan: LaunchPlan) -> Iterator[Finding]:

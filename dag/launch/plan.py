@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...errors import ConfigError
 from ..configuration import ConfigFile, find_config, nearest
@@ -15,7 +15,11 @@ from ..schema import ModuleSpec
 from .lookup import config_folders
 from .schema import LaunchSpec, ProcessSpec
 
-__all__ = ["LaunchPlan", "plan_modules"]
+if TYPE_CHECKING:
+    from ...datamesh.transport import ZenohConfig
+    from .linking import LinkPlan
+
+__all__ = ["LaunchPlan", "plan_modules", "plan_zenoh"]
 
 Changes = Mapping[tuple[str, ...], Any]
 
@@ -96,6 +100,23 @@ def plan_modules(
                 f"setting {'.'.join(key)}: no component {key[0]!r}; {nearest(key[0], {*known, 'profile', 'launch'})}"
             )
     return modules
+
+
+def plan_zenoh(plans: Mapping[str, LinkPlan], zenoh: ZenohConfig) -> dict[str, ZenohConfig]:
+    """How each process of a node joins the network.
+
+    At an endpoint one process can listen: the first that has topics between hosts. The others connect to it there, and
+    zenoh's gossip makes them known to whoever does so too; what they send does not go through it.
+
+    Args:
+        plans: The links of all processes.
+        zenoh: What the launch file says.
+    """
+    first = next((name for name, plan in plans.items() if plan.remote), None)
+    other = zenoh
+    if zenoh.mode == "peer" and zenoh.listen:
+        other = zenoh.model_copy(update={"connect": (*zenoh.connect, *zenoh.listen), "listen": ()})
+    return {name: zenoh if name == first else other for name in plans}
 
 
 def _module_path(beside: Path, name: str, shipped: Path) -> Path:

@@ -21,7 +21,7 @@ from ..configuration import nearest
 from .cgroup import ControlGroups
 from .control import ControlServer
 from .order import consumers_first
-from .plan import LaunchPlan
+from .plan import LaunchPlan, plan_zenoh
 from .run_folder import RotatedLog, RunFolder
 from .schema import ProcessSpec
 from .signals import SignalInbox
@@ -141,7 +141,7 @@ class Supervisor:
             "process": spec.model_dump(),
             "links": dataclasses.asdict(self.links[spec.name]),
             "shared_memory": self.plan.spec.shared_memory.model_dump(),
-            "zenoh": self.plan.spec.zenoh.model_dump(),
+            "zenoh": plan_zenoh(self.links, self.plan.spec.zenoh)[spec.name].model_dump(),
             **self._child_plan(spec),
         }
         text = json.dumps(plan, default=str)

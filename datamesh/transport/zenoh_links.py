@@ -58,7 +58,8 @@ class ZenohSession:
         try:
             settings.insert_json5("mode", json.dumps(config.mode))
             settings.insert_json5("connect/endpoints", json.dumps(config.connect))
-            settings.insert_json5("listen/endpoints", json.dumps(config.listen))
+            if config.listen:  # an empty list would be its choice to listen nowhere, so that nobody finds it
+                settings.insert_json5("listen/endpoints", json.dumps(config.listen))
             settings.insert_json5("scouting/multicast/enabled", json.dumps(config.scouting))
             # On one host topics go by slabs, and its segments outlive a process that is killed.
             settings.insert_json5("transport/shared_memory/enabled", "false")

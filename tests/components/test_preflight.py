@@ -1,6 +1,7 @@
 """Preflight: what is missing is named, each with the way out."""
 
 import importlib.util
+import json
 import shutil
 import socket
 
@@ -156,10 +157,10 @@ def test_two_components_on_one_port_are_told(plan):
 def sends(plan, tmp_path):
     """Makes the same plan with topics that go between hosts."""
 
-    def make(*topics):
+    def make(*topics, listen=()):
         whole = plan()
         text = f"node: one\nprocesses: [{{name: process, modules: [mine.yaml]}}]\nremote: {{{', '.join(topics)}}}\n"
-        (tmp_path / "l.yaml").write_text(text)
+        (tmp_path / "l.yaml").write_text(f"{text}zenoh: {json.dumps({'listen': listen})}\n")
         return LaunchPlan(load_launch_file(tmp_path / "l.yaml"), whole.modules, whole.profile)
 
     return make
@@ -171,6 +172,35 @@ def test_a_topic_between_hosts_that_the_node_has_no_use_for_is_told(sends):
     said = one(check_remote(sends("raw: zenoh", "rwa: zenoh")), False)
     assert "topic 'rwa'; did you mean 'raw'?" in said
     assert "l.yaml" in said
+
+
+def test_an_endpoint_that_cannot_be_listened_at_is_told(sends):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        assert list(check_remote(sends(listen=[where]))) == []  # nothing goes between hosts
+        said = one(check_remote(sends("raw: zenoh", listen=[where])), False)
+        everywhere = f"tcp/0.0.0.0:{taken.getsockname()[1]}"
+        assert f"zenoh: {everywhere} is taken" in one(check_remote(sends("raw: zenoh", listen=[everywhere])), False)
+    assert f"zenoh: {where} is taken: Address already in use" in said
+    assert "correct zenoh.listen of" in said
+    assert "is free" in one(check_remote(sends("raw: zenoh", listen=[where])), True)
+    assert "is free" in one(check_remote(sends("raw: zenoh", listen=["tcp/[::1]:0#iface=lo"])), True)
+    assert list(check_remote(sends("raw: zenoh", listen=["udp/127.0.0.1:7447", "unixsock-stream//tmp/x"]))) == []
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("tcp/192.0.2.1:7447", "cannot be listened at: Cannot assign requested address"),
+        ("tcp/127.0.0.1:65536", "is no endpoint: Port out of range"),
+        ("tcp/127.0.0.1", "has no port"),
+        ("tls/[::1:7447", "is no endpoint: Invalid IPv6 URL"),
+    ],
+)
+def test_an_endpoint_that_is_none_of_this_host_is_told(sends, endpoint, said):
+    assert f"zenoh: {endpoint} {said}" in one(check_remote(sends("raw: zenoh", listen=[endpoint])), False)
 
 
 def test_topics_between_hosts_without_what_carries_them_are_told(sends, monkeypatch):

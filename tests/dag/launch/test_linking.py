@@ -5,10 +5,11 @@ import threading
 import pytest
 
 from warploom.dag.launch.linking import LinkPlan, Links, plan_links
+from warploom.dag.launch.plan import plan_zenoh
 from warploom.dag.modules import load_module
 from warploom.dag.process import Process
 from warploom.datamesh import CommitPolicy, DataMesh, Output
-from warploom.datamesh.transport import SharedMemoryConfig
+from warploom.datamesh.transport import SharedMemoryConfig, ZenohConfig
 from warploom.errors import ConfigError
 
 DOUBLE = """\
@@ -115,6 +116,20 @@ class TestPlan:
 
     def test_an_optional_input_needs_no_producer(self, modules):
         assert plan_links(modules(one=[double("a", "b"), listens("b", "nobody")]), remote={"a": "zenoh"})
+
+    def test_one_process_listens_for_other_hosts_and_the_others_connect_to_it(self, modules):
+        plans = plan_links(
+            modules(idle=[PLAIN], one=[double("a", "b")], two=[listens("b", "d")], three=[double("b", "c")]),
+            remote={"a": "zenoh", "c": "zenoh", "d": "zenoh"},
+        )
+        zenoh = ZenohConfig(connect=("tcp/far:1",), listen=("tcp/0.0.0.0:7447",), domain="car")
+        joins = plan_zenoh(plans, zenoh)
+        assert joins["one"] == zenoh
+        for name in ("two", "three"):
+            assert joins[name].connect == ("tcp/far:1", "tcp/0.0.0.0:7447")
+            assert (joins[name].listen, joins[name].domain) == ((), "car")
+        for alike in (ZenohConfig(connect=("tcp/far:1",)), ZenohConfig(mode="client", connect=("tcp/router:1",))):
+            assert set(plan_zenoh(plans, alike).values()) == {alike}
 
     @pytest.mark.parametrize(
         ("processes", "message"),

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import time
 from importlib import import_module
 from pathlib import Path
@@ -309,6 +310,37 @@ def test_two_nodes_run_side_by_side_and_one_of_a_name_alone(start, chain, tmp_pa
     assert f"node 'one' runs already (process {one.supervisor.pid})" in third.errors
     assert (one.stop(), two.stop()) == (0, 0)
     assert set(versions(tmp_path / "one-writer")).isdisjoint(versions(tmp_path / "two-writer"))
+
+
+def test_processes_of_a_node_share_one_endpoint_for_other_hosts(start, module, launch_file, tmp_path):
+    """Both topics reach a node that knows that endpoint alone, also after whoever listens there was killed."""
+    pytest.importorskip("zenoh")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    near = launch_file(
+        "near",
+        {"remote": dict.fromkeys(("ticks", "tocks"), "zenoh"),
+         "zenoh": {"scouting": False, "domain": "car", "listen": [endpoint]}},
+        first={"modules": [module(TICKER, "first", topic="ticks")], "back_off": {"first_s": 0.05}},
+        second=[module(TICKER, "second", topic="tocks")],
+    )  # fmt: skip
+    journals = [tmp_path / "doubled-ticks", tmp_path / "doubled-tocks"]
+    far = launch_file(
+        "far",
+        {"remote": dict.fromkeys(("ticks", "tocks"), "zenoh"),
+         "zenoh": {"scouting": False, "domain": "car", "connect": [endpoint]}},
+        third=[module(DOUBLER, "third", sent="ticks", topic="a", journal=journals[0])],
+        fourth=[module(DOUBLER, "fourth", sent="tocks", topic="b", journal=journals[1])],
+    )  # fmt: skip
+    one, two = start("launch", near).up(), start("launch", far).up()
+    two.wait_until(lambda: all(len(versions(path)) > 5 for path in journals))
+    os.kill(one.process("first")["pid"], signal.SIGKILL)
+    seen = [len(versions(path)) for path in journals]
+    two.wait_until(lambda: all(len(versions(path)) > count + 5 for path, count in zip(journals, seen, strict=True)))
+    assert one.find("died")
+    assert one.process("second")["restarts"] == 0
+    assert (one.stop(), two.stop()) == (0, 0)
 
 
 def test_a_queue_that_fills_drops_what_it_must_and_counts_it(start, module, launch_file):
