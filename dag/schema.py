@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from .backlog import BacklogConfig
 from .configuration import nearest
@@ -12,6 +13,24 @@ from .deadline import DeadlineConfig
 from .trigger import TriggerConfig
 
 __all__ = ["ComponentSpec", "FlagLoaderSpec", "ModuleSpec", "VertexSpec"]
+
+
+def _is_name(name: str) -> str:
+    """Names are shown in tables, logs and pictures, and written on the command line."""
+    if not name.strip() or not name.isprintable() or len(name) > 128:
+        raise ValueError(f"a name is 1 to 128 characters that can be shown, not {name!r}")
+    return name
+
+
+def _is_topic(topic: str) -> str:
+    """Topics between processes become the addresses of sockets."""
+    if not topic.strip() or not topic.isprintable() or len(quote(topic)) > 80:
+        raise ValueError(f"a topic is 1 to 80 characters that can be shown, beyond ASCII fewer, not {topic!r}")
+    return topic
+
+
+Name = Annotated[str, AfterValidator(_is_name)]
+Topic = Annotated[str, AfterValidator(_is_topic)]
 
 
 class _Spec(BaseModel):
@@ -38,16 +57,16 @@ class VertexSpec(_Spec):
 class ComponentSpec(_Spec):
     """One component."""
 
-    name: str
+    name: Name
     """Unique in the process."""
     kind: Literal["generic", "data", "dag", "monotonic_dag"]
     class_name: str = Field(default="", alias="class")
     """Dotted name of the class; a dag needs none."""
     config: dict[str, Any] = {}
     """What the class takes."""
-    inputs: dict[str, str] = {}
+    inputs: dict[str, Topic] = {}
     """Input → topic."""
-    outputs: dict[str, str] = {}
+    outputs: dict[str, Topic] = {}
     """Output → topic."""
     trigger: TriggerConfig = Field(TriggerConfig(), validate_default=True)
     """What starts a run: an input whose commits do, or `any`, `all` or `period_ms`."""
@@ -60,7 +79,7 @@ class ComponentSpec(_Spec):
     """Threads of a dag."""
     in_flight: int = Field(1, ge=1, le=64)
     """Frames that may be in a dag at once."""
-    graph: dict[str, VertexSpec] = {}
+    graph: dict[Name, VertexSpec] = {}
     """The vertices of a dag, by name."""
 
     @field_validator("trigger")
@@ -99,7 +118,7 @@ class FlagLoaderSpec(_Spec):
 class ModuleSpec(_Spec):
     """A module file."""
 
-    module: str
+    module: Name
     """Its name."""
     description: str = ""
     flag_loaders: list[FlagLoaderSpec] = []

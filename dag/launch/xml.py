@@ -140,6 +140,10 @@ class XmlLaunchFile(ConfigFile[LaunchSpec]):
         except expat.ExpatError as error:
             problem = expat.errors.messages[error.code]
             raise self._refuse(error.lineno, f"is not XML: {problem}") from error
+        except ConfigError:
+            raise
+        except (LookupError, ValueError) as error:  # an encoding that Python has not, or not for this
+            raise self._refuse(1, f"cannot be read: {error}; write it in UTF-8") from error
         return top.children[0]
 
     def _node(self, root: _Element) -> dict[str, Any]:

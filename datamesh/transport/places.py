@@ -92,10 +92,10 @@ def _links(node: str) -> Path:
 
 
 def _path(node: str, topic: str, kind: str) -> Path:
-    name = f"{quote(topic, safe='')}.{kind}"
-    if not topic or len(name) > 200:
-        raise ConfigError(f"topic {topic!r} cannot be exported: its name becomes that of a file")
-    return _links(node) / name
+    name = quote(topic, safe="/").replace("/", "+")  # a + of the topic is quoted
+    if not topic or len(name) > 80:  # with "/proc/self/fd/999/" and ".socket" it is an address
+        raise ConfigError(f"topic {topic!r} cannot be exported: its name becomes that of a file of 1 to 80 bytes")
+    return _links(node) / f"{name}.{kind}"
 
 
 @contextmanager
@@ -215,7 +215,7 @@ def peer_of(connection: socket.socket) -> tuple[int, int]:
 
 def exported_topics(node: str) -> list[str]:
     """The topics that a live process exports, sorted."""
-    return sorted(unquote(path.stem) for path in _links(node).glob("*.socket") if _is_alive(path))
+    return sorted(unquote(path.stem.replace("+", "/")) for path in _links(node).glob("*.socket") if _is_alive(path))
 
 
 def _is_alive(path: Path) -> bool:

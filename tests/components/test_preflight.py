@@ -233,6 +233,15 @@ def test_a_sensor_whose_name_is_not_that_of_the_profile_is_told(plan):
     assert one(check_sensors(plan("sensors: {radar: [{name: rof}]}")), True), "a profile without a lidar is for any"
 
 
+def test_a_sensor_whose_name_is_none_is_left_to_the_building(plan):
+    whole = plan("sensors: {lidar: [{name: roof, source: 'sim:street'}]}")
+    component = whole.modules["process"][0].content.components
+    for one_of in component:
+        if "sensor" in one_of.config:
+            one_of.config["sensor"] = ["roof"]
+    assert list(check_sensors(whole)) == []
+
+
 def test_settings_of_the_profile_for_nothing_in_the_node_are_told(plan):
     said = one(check_settings(plan("settings: {drivr.rate_hz: 5, driver.rate_hz: 5}")), True)
     assert "drivr.rate_hz of " in said

@@ -107,6 +107,14 @@ def test_entities_are_refused_before_they_mean_anything(tmp_path, head):
         load(tmp_path, head + GOOD.replace("compute3d_sched</name>", "&y;</name>"))
 
 
+@pytest.mark.parametrize("encoding", ["UTF-1e400", "shift_jis", "rot13"])
+def test_an_encoding_that_cannot_be_read_is_told(tmp_path, encoding):
+    path = tmp_path / "x.launch.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><cybertron/>')
+    with pytest.raises(ConfigError, match=r"x.launch.xml:1: cannot be read: .*write it in UTF-8"):
+        XmlLaunchFile(path)
+
+
 def test_what_is_endless_deep_or_huge_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="deep"):
         load(tmp_path, "<cybertron>" + "<a>" * 50_000)
