@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -45,7 +45,7 @@ SensorKind = Literal["lidar", "camera", "radar", "gnss", "imu", "wheel"]
 
 
 class _Spec(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ThreadsSpec(_Spec):
@@ -71,10 +71,13 @@ class LidarSpec(_Spec):
     """Height above the ground [m]; left out, that of the first LiDAR's mounting, or else estimated in each frame."""
 
 
+_Metres = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+
+
 class MountingSpec(_Spec):
     """Where a sensor is on the vehicle: x forward, y left, z up, the origin on the ground under the rear axle."""
 
-    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    xyz: tuple[_Metres, _Metres, _Metres] = (0.0, 0.0, 0.0)
     """Of its centre [m]."""
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw: about x, then y, then z of the vehicle [deg]."""
@@ -83,7 +86,7 @@ class MountingSpec(_Spec):
 class SensorSpec(_Spec):
     """One sensor. A name alone stands for a sensor of which nothing more is known."""
 
-    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}$")
     """What topics and placeholders call it; unique among all sensors."""
     model: str | None = None
     """Its type, such as pandar90."""

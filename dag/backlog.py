@@ -22,7 +22,7 @@ _SETTLED = 256
 class BacklogConfig(BaseModel):
     """What happens when triggers come faster than the component runs."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     policy: Literal["latest", "fifo", "block"] = "latest"
     """latest: the newest replaces what waits; fifo: a queue that drops when full; block: the producer waits."""

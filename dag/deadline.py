@@ -16,7 +16,7 @@ __all__ = ["DeadlineConfig", "FrameDeadline"]
 class DeadlineConfig(BaseModel):
     """By when a component is to be done with a frame."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     ms: float = Field(gt=0.0)
     """From when the sensor's data was received, or else from the trigger [ms]."""

@@ -78,9 +78,9 @@ class Out(_Port[T]):
 
 
 class ProcessorConfig(BaseModel):
-    """The base of configurations: unknown keys are refused."""
+    """The base of configurations: unknown keys are refused, and numbers that are not finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def declared_ports(processor: type) -> dict[str, In | Out]:

@@ -34,7 +34,7 @@ Topic = Annotated[str, AfterValidator(_is_topic)]
 
 
 class _Spec(BaseModel):
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", populate_by_name=True, allow_inf_nan=False)
 
 
 class VertexSpec(_Spec):

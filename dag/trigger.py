@@ -33,7 +33,7 @@ class Trigger(NamedTuple):
 class TriggerConfig(BaseModel):
     """Which events start a run: `lidar`, `{any: [a, b]}`, `{all: [a, b], tolerance_ms: 20}` or `{period_ms: 100}`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     any: tuple[str, ...] = ()
     """A commit to any of these inputs; a version that several of them have triggers once."""

@@ -14,7 +14,7 @@ _ENDPOINT = re.compile(r"[a-z0-9_-]+/[\x21-\x7e]+")
 class SharedMemoryConfig(BaseModel):
     """Topics between the processes of a host."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     memory_bytes: int = Field(1 << 32, ge=4096, le=1 << 44)
     """Address space of a topic, a power of two; memory is taken as it is used [B]."""
@@ -48,7 +48,7 @@ class SharedMemoryConfig(BaseModel):
 class ZenohConfig(BaseModel):
     """Topics between hosts, over zenoh."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     mode: str = Field("peer", pattern="^(peer|client)$")
     """peer: hosts find each other; client: all goes by way of a router."""

@@ -59,6 +59,15 @@ def written(tmp_path, text):
         ("sensors:\n  lidar: [9top]", 4, "String should match pattern"),
         ("sensors:\n  lidar:\n    - {model: vlp16}", 5, "lidar.0.name: this key is missing"),
         ("sensors:\n  lidar:\n    - {name: a, mounting: {xyz: [1, 2]}}", 5, "mounting.xyz.2: this key is missing"),
+        (
+            "sensors:\n  lidar:\n    - {name: a, mounting: {xyz: [1, 2, .nan]}}",
+            5,
+            "xyz.2: Input should be a finite number",
+        ),
+        ("sensors:\n  lidar:\n    - {name: a, mounting: {xyz: [1, 2e9, 0]}}", 5, "less than or equal to 1000"),
+        ("sensors:\n  lidar:\n    - {name: a, mounting: {rpy_deg: [.inf, 0, 0]}}", 5, "should be a finite number"),
+        ("latency_budget_ms: .inf", 3, "latency_budget_ms: Input should be a finite number"),
+        (f"sensors:\n  lidar: [{65 * 'a'}]", 4, "String should match pattern"),
         ("memory_gib: -1", 3, "Input should be greater than 0"),
     ],
 )

@@ -61,6 +61,7 @@ def test_a_component_takes_sensible_defaults(write):
         ("kind: dag", "kind: dag\n    workers: 0", 5, "workers: Input should be greater than or equal to 1, found 0"),
         ("kind: dag", "kind: dag\n    in_flight: 1.5", 5, "in_flight: Input should be a valid integer"),
         ("kind: dag", "kind: dag\n    backlog: {policy: lifo}", 5, "backlog.policy: Input should be 'latest', 'fifo'"),
+        ("kind: dag", "kind: dag\n    deadline: {ms: .inf}", 5, "deadline.ms: Input should be a finite number"),
         ("kind: dag", "kind: dag\n    backlog: {dept: 3}", 5, "backlog.dept: unknown key; did you mean 'depth'?"),
     ],
 )  # fmt: skip
