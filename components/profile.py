@@ -128,7 +128,7 @@ class Profile(_Spec):
     """Which library computes a kernel, by `BACKEND_KERNELS`: warp, taichi, taichi:vulkan …; left out: warp."""
     capacity: int = Field(200_000, ge=1, le=16_000_000)
     """Points of a cloud that there is room for; further ones are dropped, and counted."""
-    latency_budget_ms: float = Field(100.0, gt=0.0)
+    latency_budget_ms: float = Field(100.0, gt=0.0, le=86_400_000.0)
     """From the reception of a LiDAR frame to the commit of its obstacles [ms]."""
     threads: ThreadsSpec = ThreadsSpec()
     lidar: LidarSpec = LidarSpec()

@@ -18,7 +18,7 @@ class DeadlineConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    ms: float = Field(gt=0.0)
+    ms: float = Field(gt=0.0, le=86_400_000.0)
     """From when the sensor's data was received, or else from the trigger [ms]."""
     on_miss: Literal["count", "degrade", "cut"] = "count"
     """count: nothing else happens; degrade: expendable vertices that have not started are left out; cut: everything

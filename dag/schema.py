@@ -48,7 +48,7 @@ class VertexSpec(_Spec):
     """In port → name of the datum; a port that is left out takes the datum of its own name."""
     outputs: dict[str, str] = Field(default={}, alias="out")
     """Out port → name of the datum; a port that is left out gives the datum of its own name."""
-    deadline_ms: float | None = Field(None, gt=0.0)
+    deadline_ms: float | None = Field(None, gt=0.0, le=86_400_000.0)
     """From when its inputs are there to its end; what takes longer is counted [ms]."""
     expendable: bool = False
     """Whether it is left out in a frame past the component's deadline, with `on_miss: degrade`."""

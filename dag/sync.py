@@ -49,7 +49,7 @@ def _begin_waits(waits: Iterable[Callable[[Callable[[Waiting], None]], Waiting]]
 class _GetRecentConfig(ProcessorConfig):
     input: str
     """The component's input to look at."""
-    max_age_ms: float | None = Field(None, ge=0.0)
+    max_age_ms: float | None = Field(None, ge=0.0, le=86_400_000.0)
     """How much older than the trigger the datum may be [ms]; null is any age."""
 
 
@@ -137,9 +137,9 @@ class Aligned:
 class _AlignConfig(ProcessorConfig):
     inputs: tuple[str, ...] = Field(min_length=1)
     """The component's inputs to wait for."""
-    timeout_ms: float = Field(ge=0.0)
+    timeout_ms: float = Field(ge=0.0, le=86_400_000.0)
     """From the trigger to the end of the wait [ms]; at zero it only looks."""
-    tolerance_ms: float = Field(0.0, ge=0.0)
+    tolerance_ms: float = Field(0.0, ge=0.0, le=86_400_000.0)
     """How far from the trigger's version those of the inputs may be [ms]."""
     partial: bool = True
     """Whether what was found is given on when something is absent."""
@@ -240,7 +240,7 @@ class _CommitConfig(ProcessorConfig):
     """What to do with a version that is there already."""
     triggers: bool | None = None
     """Whether it starts runs; null: if it becomes the newest."""
-    delay_ms: float = Field(100.0, ge=0.0)
+    delay_ms: float = Field(100.0, ge=0.0, le=86_400_000.0)
     """How long `reorder` holds a datum back at most [ms]."""
     depth: int = Field(4, ge=0)
     """How many data `reorder` holds back at most."""

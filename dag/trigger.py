@@ -39,9 +39,9 @@ class TriggerConfig(BaseModel):
     """A commit to any of these inputs; a version that several of them have triggers once."""
     all: tuple[str, ...] = ()
     """When all of these inputs have the version of the first, or one near it; that of the first is the trigger's."""
-    tolerance_ms: float = Field(0.0, ge=0.0)
+    tolerance_ms: float = Field(0.0, ge=0.0, le=86_400_000.0)
     """How far from the version of the first the others of `all` may be [ms]."""
-    period_ms: float | None = Field(None, gt=0.0)
+    period_ms: float | None = Field(None, ge=0.1, le=86_400_000.0)
     """Every so long, by the mesh's clock [ms]."""
     overrun: Literal["skip", "coalesce"] = "skip"
     """What happens to ticks of a period while the component is busy: skip drops them, coalesce keeps the newest."""

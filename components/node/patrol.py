@@ -52,7 +52,7 @@ class PatrolReport:
 class ProcessPatrolConfig(ProcessorConfig):
     """What is not well."""
 
-    silent_s: float = Field(5.0, gt=0.0)
+    silent_s: float = Field(5.0, gt=0.0, le=86_400.0)
     """Without a sign of life for so long [s]."""
     resident_mib: float | None = Field(None, gt=0.0)
     """More memory than this [MiB]; null: any is well."""

@@ -26,15 +26,15 @@ class SharedMemoryConfig(BaseModel):
     """How many data are kept for a reader that was killed, until it is back."""
     kept_bytes: int = Field(1 << 28, ge=0)
     """How much memory they may take together, about [B]."""
-    kept_s: float = Field(10.0, ge=0.0)
+    kept_s: float = Field(10.0, ge=0.0, le=86_400.0)
     """For how long [s]."""
     announce: bool = True
     """Whether readers are woken when a change is begun, so as to be ready for its commit."""
-    spin_us: float = Field(1000.0, ge=0.0)
+    spin_us: float = Field(1000.0, ge=0.0, le=1e6)
     """For how long a reader stays awake, at most, for a datum that is announced and due; 0: it sleeps [µs]."""
     spin_share: float = Field(0.1, ge=0.0, le=1.0)
     """Of a core, how much that may take."""
-    retry_ms: float = Field(20.0, gt=0.0)
+    retry_ms: float = Field(20.0, gt=0.0, le=60_000.0)
     """How long a reader waits before it looks for its producer again [ms]."""
 
     @field_validator("memory_bytes")

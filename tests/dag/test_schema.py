@@ -62,6 +62,8 @@ def test_a_component_takes_sensible_defaults(write):
         ("kind: dag", "kind: dag\n    in_flight: 1.5", 5, "in_flight: Input should be a valid integer"),
         ("kind: dag", "kind: dag\n    backlog: {policy: lifo}", 5, "backlog.policy: Input should be 'latest', 'fifo'"),
         ("kind: dag", "kind: dag\n    deadline: {ms: .inf}", 5, "deadline.ms: Input should be a finite number"),
+        ("    trigger: lidar\n    inputs: {lidar: lidar/points}\n    out", "    trigger: {period_ms: 1e+300}\n    out",
+         5, "trigger.period_ms: Input should be less than or equal to 86400000"),
         ("kind: dag", "kind: dag\n    backlog: {dept: 3}", 5, "backlog.dept: unknown key; did you mean 'depth'?"),
     ],
 )  # fmt: skip

@@ -27,7 +27,7 @@ def test_a_trigger_is_an_input_or_some_or_a_time(given, inputs, period):
         ({"any": ["a"], "all": ["b"]}, "one of any, all and period_ms, not any and all"),
         ({"any": ["a"], "tolerance_ms": 3}, "tolerance_ms belongs to a trigger of kind `all`"),
         ({"all": ["a"], "overrun": "coalesce"}, "overrun belongs to a trigger with period_ms"),
-        ({"period_ms": 0}, "greater than 0"),
+        ({"period_ms": 0}, "greater than or equal to 0.1"),
         ({"all": ["a"], "tolerance_ms": -1}, "greater than or equal to 0"),
         (["a", "b"], "the name of an input, {any: [a, b]}, {all: [a, b]} or {period_ms: 100}, not ['a', 'b']"),
         (100, "or {period_ms: 100}, not 100"),
