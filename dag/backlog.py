@@ -26,7 +26,7 @@ class BacklogConfig(BaseModel):
 
     policy: Literal["latest", "fifo", "block"] = "latest"
     """latest: the newest replaces what waits; fifo: a queue that drops when full; block: the producer waits."""
-    depth: int = Field(1, ge=1)
+    depth: int = Field(1, ge=1, le=1 << 20)
     """How many triggers may wait; `latest` keeps one."""
     drop: Literal["oldest", "newest"] = "oldest"
     """Which one a full fifo drops."""

@@ -242,7 +242,7 @@ class _CommitConfig(ProcessorConfig):
     """Whether it starts runs; null: if it becomes the newest."""
     delay_ms: float = Field(100.0, ge=0.0, le=86_400_000.0)
     """How long `reorder` holds a datum back at most [ms]."""
-    depth: int = Field(4, ge=0)
+    depth: int = Field(4, ge=0, le=1 << 16)
     """How many data `reorder` holds back at most."""
 
 

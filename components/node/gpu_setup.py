@@ -19,7 +19,7 @@ class GpuSetupConfig(ProcessorConfig):
 
     memory_pool: bool = True
     """Whether memory is taken from CUDA's pool, where the driver has one: an allocation then costs no wait."""
-    keep_mib: int = Field(256, ge=0)
+    keep_mib: int = Field(256, ge=0, le=1 << 20)
     """How much of the pool stays with the process when it is free [MiB]."""
 
 

@@ -21,7 +21,7 @@ __all__ = ["BackgroundConfig", "BackgroundProcessor"]
 class BackgroundConfig(ProcessorConfig):
     """What makes a background box."""
 
-    min_size: int = Field(10, ge=1)
+    min_size: int = Field(10, ge=1, le=1 << 24)
     """Points that must be left of a cluster, once those of known objects are taken out."""
     min_height: float = Field(0.3, ge=0.0)
     """Lower boxes are left out [m]."""

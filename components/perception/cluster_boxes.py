@@ -35,7 +35,7 @@ class ClusterBoxConfig(ProcessorConfig):
 
     split_length: float = Field(10.0, gt=0.0)
     """Longer clusters, such as walls and hedges, are cut into pieces of about this length [m]."""
-    max_boxes: int = Field(1024, ge=1)
+    max_boxes: int = Field(1024, ge=1, le=1 << 16)
     """Boxes that there is room for; the clusters farther down the list get none, and are counted."""
 
 

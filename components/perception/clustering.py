@@ -38,7 +38,7 @@ class ClusterConfig(ProcessorConfig):
     """Points no farther apart belong together [m]."""
     radius_per_metre: float = Field(0.0, ge=0.0, le=1.0)
     """By how much that grows per metre of range: 0, or from 1e-5."""
-    min_size: int = Field(10, ge=1)
+    min_size: int = Field(10, ge=1, le=1 << 24)
     """Clusters of fewer points are left out."""
     min_height: float = 0.1
     """Points lower above the ground are left out [m]."""

@@ -49,9 +49,9 @@ class TrackerSettings(ProcessorConfig):
     """No track outlives a longer gap between frames [s]."""
     score_weight: float | None = Field(None, gt=0.0, le=1.0)
     """Least weight of the newest score in a track's mean."""
-    max_detections: int | None = Field(None, ge=1)
+    max_detections: int | None = Field(None, ge=1, le=1 << 16)
     """More in one frame are dropped, those of lowest score."""
-    max_tracks: int | None = Field(None, ge=1)
+    max_tracks: int | None = Field(None, ge=1, le=1 << 16)
     """No track is begun beyond."""
 
     @model_validator(mode="after")
