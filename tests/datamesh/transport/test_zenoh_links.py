@@ -67,12 +67,15 @@ def received(reader, count):
 @pytest.fixture
 def multicast():
     """Skips where hosts cannot find each other: zenoh alone, as it comes, is asked."""
-    with zenoh.open(zenoh.Config()) as one, zenoh.open(zenoh.Config()) as other:
-        end = time.monotonic() + 5
-        while other.info.zid() not in list(one.info.peers_zid()):
-            if time.monotonic() > end:
-                pytest.skip("no multicast on this network: zenoh's own sessions do not find each other")
-            time.sleep(0.01)
+    try:
+        with zenoh.open(zenoh.Config()) as one, zenoh.open(zenoh.Config()) as other:
+            end = time.monotonic() + 5
+            while other.info.zid() not in list(one.info.peers_zid()):
+                if time.monotonic() > end:
+                    pytest.skip("no multicast on this network: zenoh's own sessions do not find each other")
+                time.sleep(0.01)
+    except zenoh.ZError as error:
+        pytest.skip(f"zenoh does not start as it comes: {error}")
 
 
 @pytest.mark.usefixtures("multicast")
