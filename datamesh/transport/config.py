@@ -30,7 +30,7 @@ class SharedMemoryConfig(BaseModel):
     """For how long [s]."""
     announce: bool = True
     """Whether readers are woken when a change is begun, so as to be ready for its commit."""
-    spin_us: float = Field(1000.0, ge=0.0, le=1e6)
+    spin_us: float = Field(1000.0, ge=0.0, le=3.6e9)
     """For how long a reader stays awake, at most, for a datum that is announced and due; 0: it sleeps [µs]."""
     spin_share: float = Field(0.1, ge=0.0, le=1.0)
     """Of a core, how much that may take."""
