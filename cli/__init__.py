@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 
 import typer
@@ -19,12 +21,20 @@ for _part in (running, node, inspecting, configuring, recording, measuring, prof
 
 def main() -> None:
     """Runs the command: exit code 0 when it is done, 2 for bad usage or configuration, 1 when it failed."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (to the end)
     try:
         app()
     except (ConfigError, DeviceError, ModelError) as error:
         typer.echo(f"warploom: {error}", err=True)
         sys.exit(2)
     except WarploomError as error:
+        typer.echo(f"warploom: {error}", err=True)
+        sys.exit(1)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
         typer.echo(f"warploom: {error}", err=True)
         sys.exit(1)
     except KeyboardInterrupt:

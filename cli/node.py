@@ -219,7 +219,7 @@ def top(
         if sys.stdout.isatty() and not as_json:
             from rich.live import Live
 
-            live = stack.enter_context(Live(auto_refresh=False))
+            live = stack.enter_context(Live(console=_console(), auto_refresh=False))
             show = functools.partial(live.update, refresh=True)
         before = client.ask("ps")
         while not count or shown < count:
@@ -333,4 +333,4 @@ def _console() -> Console:
     """The terminal, or room for the tables where what is printed goes elsewhere."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 160)
+    return Console(width=None if sys.stdout.isatty() else 160, markup=False, emoji=False)

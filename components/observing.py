@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import http.server
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from ..dag import DataProcessComponent, Process
 from ..dag.metrics import Metrics
@@ -17,6 +18,13 @@ from ..errors import ConfigError
 from .pipeline import OBSTACLES_TOPIC, Pipeline
 
 __all__ = ["MetricsServer", "Observer"]
+
+
+class _Server(http.server.ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Who breaks off is no news; the rest is."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
 
 class MetricsServer:
@@ -34,6 +42,8 @@ class MetricsServer:
         """
 
         class Handler(http.server.BaseHTTPRequestHandler):
+            timeout = 5.0  # whoever connects and says nothing is let go of
+
             def do_GET(self) -> None:
                 body = text().encode() if self.path.split("?")[0] == "/metrics" else b""
                 self.send_response(200 if body else 404)
@@ -46,7 +56,7 @@ class MetricsServer:
                 pass
 
         try:
-            self._server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler)
+            self._server = _Server(("127.0.0.1", port), Handler)
         except (OSError, OverflowError) as error:
             raise ConfigError(f"port {port} cannot be used for metrics: {error}; take another, or 0 for any") from error
         self.port: int = self._server.server_address[1]

@@ -25,6 +25,7 @@ from .schema import ProcessSpec
 
 if TYPE_CHECKING:
     from ..process import Process
+    from .health import ProcessObserver
 
 __all__ = ["CONFIGURATION", "Child", "ProcessLinks", "die_with", "end_at_once", "show_name"]
 
@@ -184,7 +185,7 @@ class Child:
                 links.stop()
             return 1
         self._links = links
-        self._channel.send({"report": "running", **observer.beat()})
+        self._channel.send({"report": "running", **_told(observer)})
         beats = threading.Thread(
             target=self._beat, args=(observer, beat_period(self._spec.health_timeout_s)), daemon=True
         )
@@ -193,18 +194,13 @@ class Child:
         while self._orders.get() != "stop":
             pass
         self._stop(process, links)
-        self._channel.send({"report": "stopped", **observer.beat()})
+        self._channel.send({"report": "stopped", **_told(observer)})
         return 0
 
     def _beat(self, observer: Any, period_s: float) -> None:
         while not self._beating.wait(period_s):
             self._guard(self._spec.health_timeout_s)
-            try:
-                beat = observer.beat()
-            except Exception:
-                _log.exception("the state of the process cannot be told")
-                beat = {"hanging": []}
-            if not self._channel.send({"report": "beat", **beat}):
+            if not self._channel.send({"report": "beat", **_told(observer)}):
                 return
 
     def _guard(self, seconds: float | None) -> None:
@@ -219,3 +215,12 @@ class Child:
         links.stop_imports()
         process.stop()
         links.stop()
+
+
+def _told(observer: ProcessObserver) -> dict[str, Any]:
+    """A sign of life; what cannot be told does not make the process sick."""
+    try:
+        return observer.beat()
+    except Exception:
+        _log.exception("the state of the process cannot be told")
+        return {"hanging": []}

@@ -81,7 +81,7 @@ class ControlServer:
     async def _answer(self, line: bytes, writer: asyncio.StreamWriter) -> dict[str, Any]:
         try:
             request = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             return {"id": None, "ok": False, "error": f"not a line of JSON: {error}"}
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
             return {"id": None, "ok": False, "error": 'expected an object with a key "request"'}

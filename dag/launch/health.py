@@ -14,6 +14,9 @@ from ..process import Process
 __all__ = ["ProcessObserver", "beat_period"]
 
 
+_DEPTH = 8
+
+
 def beat_period(health_timeout_s: float | None) -> float:
     """How often a child gives a sign of life [s]: several times within the timeout, once a second at most."""
     return 1.0 if health_timeout_s is None else min(1.0, health_timeout_s / 4)
@@ -84,17 +87,16 @@ class ProcessObserver:
         state: dict[str, dict[str, Any]] = {}
         for name, component in self._process.components.items():
             said = getattr(component, "instance", component)
-            reason = getattr(said, "idle_because", None)
-            if reason:
-                idle[name] = str(reason)
-            if reason := getattr(said, "starting_because", None):
-                starting[name] = str(reason)
-            tell = getattr(said, "state", None)
-            if callable(tell):
-                try:
-                    state[name] = dict(tell())  # type: ignore[call-overload]
-                except Exception as error:  # a part that cannot tell its state does not make the process sick
-                    state[name] = {"state failed": f"{type(error).__name__}: {error}"}
+            try:
+                if reason := getattr(said, "idle_because", None):
+                    idle[name] = str(reason)
+                if reason := getattr(said, "starting_because", None):
+                    starting[name] = str(reason)
+                tell = getattr(said, "state", None)
+                if callable(tell):
+                    state[name] = _plain(dict(tell()))  # type: ignore[call-overload]
+            except Exception as error:  # a part that cannot tell its state does not make the process sick
+                state[name] = {"state failed": f"{type(error).__name__}: {error}"}
         commits = dict(self._commits)
         passed = max(now - self._seen_at, 1e-6)
         rates = {topic: round((n - self._seen[topic]) / passed, 2) for topic, n in commits.items()}
@@ -130,6 +132,17 @@ class ProcessObserver:
             return math.inf
         started = isinstance(component, DataProcessComponent) and component.has_run
         return self._hang_s if started else max(self._hang_s, self._first_s)
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    """What a component says of itself as JSON takes it: keys are texts, and so is what it does not know."""
+    if isinstance(value, (str, int, type(None))) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    if depth < _DEPTH and isinstance(value, Mapping):
+        return {str(key): _plain(one, depth + 1) for key, one in value.items()}
+    if depth < _DEPTH and isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(one, depth + 1) for one in value]
+    return str(value)
 
 
 def _kind(component: Component) -> str:

@@ -86,7 +86,6 @@ class Life:
     """What it said of its end."""
     hung: str = ""
     """Why it was killed."""
-    restarting: bool = False
     answers: dict[int, asyncio.Future[dict[str, Any]]] = field(default_factory=dict)
     """Those that are waited for, by the number of the order."""
     _writer: asyncio.StreamWriter | None = None

@@ -100,7 +100,7 @@ def plain_value(value: Any, depth: int = 0) -> Any:
     if isinstance(value, (bool, int, type(None))):
         return value
     if isinstance(value, float):
-        return round(value, 6)
+        return round(value, 6) if math.isfinite(value) else str(value)  # which JSON has not
     if isinstance(value, str):
         return value if len(value) <= _SHOWN_TEXT else f"{value[:_SHOWN_TEXT]}… ({len(value)} characters)"
     if isinstance(value, (bytes, bytearray, memoryview)):
@@ -133,7 +133,7 @@ def _shortened(items: dict[str, Any]) -> dict[str, Any]:
 
 def _array(array: np.ndarray) -> Any:
     if array.size <= _SHOWN_ITEMS and array.dtype.kind in "biuf":
-        return array.tolist()
+        return array.tolist() if np.isfinite(array).all() else plain_value(array.tolist())
     text = f"{array.dtype}{list(array.shape)}"
     if array.dtype.kind in "iuf" and array.size:
         finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
@@ -159,10 +159,16 @@ class RateMeter:
         self._arrivals.append(time.monotonic() if now is None else now)
         self.count += 1
 
-    def figures(self) -> dict[str, float | int]:
-        """`hz`, and of the intervals between arrivals min, mean, max and standard deviation [ms]."""
+    def figures(self, now: float | None = None) -> dict[str, float | int]:
+        """`hz`, and of the intervals between arrivals min, mean, max and standard deviation [ms].
+
+        Where nothing has come up to `now` [s] for longer than ever before and a second, that tells the silence instead.
+        """
         if len(self._arrivals) < 2:
             return {"count": self.count}
+        silent = (time.monotonic() if now is None else now) - self._arrivals[-1]
+        if silent > max(1.0, 2 * float(np.diff(np.array(self._arrivals)).max())):
+            return {"count": self.count, "hz": 0.0, "silent_s": round(silent, 3)}
         intervals = np.diff(np.array(self._arrivals)) * 1e3
         mean = float(intervals.mean())
         return {

@@ -118,6 +118,7 @@ class SupervisedProcess:
         self._ran = False
         self._asked_to_stop = False
         self._stop_wish = asyncio.Event()
+        self._restarting = False
         self._hurry_s: float | None = None
         self._numbers = 0
         self._serving = False
@@ -188,6 +189,10 @@ class SupervisedProcess:
                 if self._asked_to_stop:
                     break
                 self._forget_life()
+                if self._restarting:
+                    self._restarting = False
+                    self._before_start()
+                    continue
                 wait = await self._after_death(code)
                 if wait is None:
                     return
@@ -350,10 +355,16 @@ class SupervisedProcess:
             self._life.mail.put_nowait(("kill", None))
 
     def restart(self) -> None:
-        """Stops it and lets it start again; that counts as a death of the cause `restarted`."""
-        if self._life is not None and self.state is State.RUNNING:
-            self._life.restarting = True
-            self._life.mail.put_nowait(("stop", None))
+        """Stops it and starts it again, whatever is said of its deaths; it is counted under the cause `restarted`.
+
+        Raises:
+            ConnectionError: It does not run.
+        """
+        if self._life is None or self.state is not State.RUNNING:
+            raise ConnectionError(f"process {self.name!r} is not running: it is {self.state.value}")
+        self._restarting = True
+        self.restarts.count += 1
+        self._life.mail.put_nowait(("stop", None))
 
     async def ask(self, order: dict[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
         """Sends it an order and waits for the answer.
@@ -431,7 +442,7 @@ class SupervisedProcess:
         self._life = None
         self.exit_code = code
         asked = self._asked_to_stop and not life.hung
-        cause = "restarted" if life.restarting else "hung" if life.hung else _cause(code)
+        cause = "restarted" if self._restarting else "hung" if life.hung else _cause(code)
         said = [life.hung] if life.hung else []
         said += [exit_text(code), *([life.error] if life.error else [])]
         reason = "; ".join(said)

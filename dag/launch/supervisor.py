@@ -50,7 +50,7 @@ class Supervisor:
         links: Mapping[str, LinkPlan],
         command: Callable[[ProcessSpec, RunFolder], Sequence[str]],
         *,
-        reap: Callable[[str], Sequence[str]] = lambda node: (),
+        reap: Callable[..., Sequence[str]] = lambda node, orders: (),
         on_event: Callable[[Event], None] = lambda event: None,
         child_plan: Callable[[ProcessSpec], Mapping[str, Any]] = lambda spec: {},
         refresh: tuple[float, Callable[[], None]] | None = None,
@@ -61,7 +61,8 @@ class Supervisor:
             plan: What is to run, validated.
             links: The topics between the processes, by process.
             command: What is executed for a process.
-            reap: Removes what dead processes of the node have left of their transport; gives the names of that.
+            reap: Removes what dead processes of the node have left of their transport, gives the names of that; and
+                with `orders` false keeps what says to those that come back how far they were.
             on_event: Is told of everything that happens.
             child_plan: What a process is told in its plan file, further to its name.
             refresh: Every how many seconds something is called that shows the state; None: never.
@@ -108,7 +109,10 @@ class Supervisor:
 
     def _tell(self, event: Event) -> None:
         event = {"time": round(time.time(), 3), "node": self.plan.node, **event}
-        self._on_event(event)
+        try:
+            self._on_event(event)
+        except Exception:  # what only shows must not stop what supervises
+            _log.exception("an event cannot be shown")
         if self._control is not None:
             self._control.tell(event)
 
@@ -148,7 +152,7 @@ class Supervisor:
         self.folder.write_plan(spec.name, text)
 
         def before_start() -> None:
-            self._clean()
+            self._clean(orders=False)
             if not self.folder.plan(spec.name).exists():  # what lies in /tmp for days may be tidied away
                 with contextlib.suppress(ConfigError):  # then the process says that it finds no plan
                     self.folder.write_plan(spec.name, text)
@@ -163,11 +167,11 @@ class Supervisor:
             before_start=before_start,
         )
 
-    def _clean(self, removed: Sequence[str] = ()) -> None:
+    def _clean(self, removed: Sequence[str] = (), *, orders: bool = True) -> None:
         """Removes what dead processes have left, and tells of it, and of what was removed just before."""
         removed = list(removed)
         try:
-            removed += self._reap(self.plan.node)
+            removed += self._reap(self.plan.node, orders=orders)
         except OSError as error:
             _log.warning("what dead processes left cannot be removed: %s", error)
         if removed:
@@ -206,7 +210,10 @@ class Supervisor:
     async def _show(self) -> None:
         while self._refresh is not None:
             await asyncio.sleep(self._refresh[0])
-            self._refresh[1]()
+            try:
+                self._refresh[1]()
+            except Exception:
+                _log.exception("the state cannot be shown")
 
     async def _watch(self, process: SupervisedProcess, life: asyncio.Task[None]) -> None:
         """Ends the node where the end of a process asks for that."""
@@ -226,8 +233,8 @@ class Supervisor:
     def _end(self, code: int, reason: str) -> None:
         if not self._ending.is_set():
             self._exit_code, self._reason = code, reason
-            self._tell({"event": "ending", "code": code, "reason": reason})
             self._ending.set()
+            self._tell({"event": "ending", "code": code, "reason": reason})
 
     def _interrupted(self, number: int) -> None:
         """The first signal stops the node in order; the second lets all stop at once, and soon; the third kills."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -52,7 +53,7 @@ class LiveTable:
 
         self._status: Callable[[], Mapping[str, Any]] | None = None
         self._events: list[Mapping[str, Any]] = []
-        self._live = Live(console=console or Console(), auto_refresh=False, transient=False)
+        self._live = Live(console=console or Console(markup=False, emoji=False), auto_refresh=False, transient=False)
 
     def show(self, status: Callable[[], Mapping[str, Any]]) -> None:
         """Begins to show a node, whose status the function gives as `ps` is answered."""
@@ -61,7 +62,8 @@ class LiveTable:
 
     def close(self) -> None:
         """Leaves the last picture on the terminal."""
-        self._live.stop()
+        with contextlib.suppress(OSError):  # the terminal has gone
+            self._live.stop()
 
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Takes up an event."""
@@ -114,7 +116,7 @@ def process_table(status: Mapping[str, Any], cpu: Mapping[int, float] | None = N
 
     rows = [_process_row(process, cpu) for process in status["processes"]]
     names = [name for name in _COLUMNS if name != "cpu %" or cpu is not None]
-    widths = {name: 3 + max(len(name), *(len(row[name]) for row in rows)) for name in names}
+    widths = {name: 3 + max(len(name), *(len(row[name]) for row in rows), 0) for name in names}
     for name in _LEFT_OUT_FIRST:
         if width is None or sum(widths[one] for one in names) + _SAYS_WIDTH <= width:
             break

@@ -9,6 +9,7 @@ Memory has no name (`slabs`), so these are all that a killed process leaves behi
 from __future__ import annotations
 
 import fcntl
+import logging
 import mmap
 import os
 import socket
@@ -34,6 +35,8 @@ __all__ = [
     "run_folder",
     "unlisten",
 ]
+
+_log = logging.getLogger(__name__)
 
 _sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
 
@@ -228,11 +231,16 @@ def _is_alive(path: Path) -> bool:
     return one is not None
 
 
-def reap(node: str) -> list[str]:
+def reap(node: str, *, orders: bool = True) -> list[str]:
     """Removes what dead processes of a node left behind, and names what it removed.
 
-    Sockets whose process is gone; and once no process of the node exports anything any more, the orders of its topics.
+    Sockets whose process is gone; and where no process of the node exports anything any more, the orders of its topics.
     Memory needs no reaping: it has no name, and goes with the last process that maps it.
+
+    Args:
+        node: Which one.
+        orders: Whether the orders may go. Before a process of a node that runs is started again they must stay: it is
+            to go on where it was, or in a new epoch.
 
     Raises:
         TimeoutError: Another process of the node hangs while it begins to export.
@@ -241,7 +249,7 @@ def reap(node: str) -> list[str]:
     with _locked(folder):  # what is dead is removed, and not what has taken its place
         sockets = sorted(folder.glob("*.socket"))
         removed = [path for path in sockets if not _is_alive(path)]
-        if len(removed) == len(sockets):
+        if orders and len(removed) == len(sockets):
             removed += sorted(folder.glob("*.order"))
         for path in removed:
             path.unlink(missing_ok=True)
@@ -263,8 +271,12 @@ class OrderFile:
             size = len(_MAGIC) + _ORDER.size
             if os.fstat(fd).st_size != size:
                 os.ftruncate(fd, 0)
-                os.ftruncate(fd, size)
-            self._map = mmap.mmap(fd, size)
+            try:
+                os.posix_fallocate(fd, 0, size)  # a hole that no disk has room for would end the process by SIGBUS
+                self._map = mmap.mmap(fd, size)
+            except OSError as error:
+                _log.warning("%s: %s; the order of %r is forgotten if this process dies", path, error.strerror, topic)
+                self._map = mmap.mmap(-1, size)
         finally:
             os.close(fd)
         known = self._map[: len(_MAGIC)] == _MAGIC

@@ -1,5 +1,6 @@
 """Signs of life: what a process tells of itself, and how it is seen that a part of it hangs."""
 
+import json
 import threading
 
 import numpy as np
@@ -120,6 +121,31 @@ def test_a_part_that_cannot_tell_its_state_is_said_so(process, monkeypatch):
     monkeypatch.setattr(process.components["plain"].instance, "state", fails)
     beat = ProcessObserver(process, hang_s=None).beat()
     assert beat["state"]["plain"] == {"state failed": "OSError: the device is gone"}
+
+
+def test_whatever_a_part_says_is_said_as_plain_values(process, monkeypatch):
+    endless = {}
+    endless["itself"] = endless
+    says = {
+        (0, 1): 3,
+        np.int64(3): {np.int64(3): 5.0},
+        "nan": float("nan"),
+        "list": [np.float32(1), {2}],
+        "end": endless,
+    }
+    monkeypatch.setattr(process.components["plain"].instance, "state", lambda: says)
+    told = ProcessObserver(process, hang_s=None).beat()["state"]["plain"]
+    json.dumps(told, allow_nan=False)
+    assert told["(0, 1)"] == 3
+    assert (told["3"], told["nan"], told["list"]) == ({"3": 5.0}, "nan", ["1.0", [2]])
+
+
+def test_a_part_that_cannot_say_why_it_is_idle_is_said_so(process, monkeypatch):
+    plain = process.components["plain"].instance
+    kind = type(type(plain).__name__, (type(plain),), {"idle_because": property(lambda self: 1 / 0)})
+    monkeypatch.setattr(plain, "__class__", kind)
+    beat = ProcessObserver(process, hang_s=None).beat()
+    assert beat["state"]["plain"] == {"state failed": "ZeroDivisionError: division by zero"}
 
 
 def test_the_description_names_components_topics_and_types(process):

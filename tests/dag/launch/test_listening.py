@@ -59,7 +59,7 @@ def test_the_rate_and_its_evenness():
     assert meter.figures() == {"count": 0}
     for now in (0.0, 0.1, 0.2, 0.4):
         meter.add(now)
-    figures = meter.figures()
+    figures = meter.figures(0.5)
     assert figures["hz"] == pytest.approx(7.5)
     assert (figures["min_ms"], figures["max_ms"], figures["count"]) == (100.0, 200.0, 4)
     assert figures["std_ms"] == pytest.approx(np.std([100, 100, 200]), abs=1e-3)
@@ -69,4 +69,19 @@ def test_the_rate_is_of_the_last_commits():
     meter = RateMeter(window=2)
     for now in (0.0, 100.0, 100.1, 100.2):
         meter.add(now)
-    assert meter.figures()["hz"] == pytest.approx(10.0)
+    assert meter.figures(100.3)["hz"] == pytest.approx(10.0)
+
+
+def test_a_topic_that_has_fallen_silent_has_no_rate():
+    meter = RateMeter()
+    for now in (0.0, 0.1, 0.2, 0.4):
+        meter.add(now)
+    assert meter.figures(1.3)["hz"] == pytest.approx(7.5)
+    assert meter.figures(1.5) == {"count": 4, "hz": 0.0, "silent_s": 1.1}
+    meter.add(1.6)
+    assert meter.figures(2.7)["hz"] == pytest.approx(2.5), "it comes as seldom as that"
+
+
+def test_what_is_not_finite_is_shown_as_json_has_it():
+    shown = plain_value({"a": float("inf"), "b": np.array([1.0, np.nan]), "c": np.float32("-inf")})
+    assert shown == {"a": "inf", "b": [1.0, "nan"], "c": "-inf"}

@@ -312,6 +312,24 @@ def test_two_nodes_run_side_by_side_and_one_of_a_name_alone(start, chain, tmp_pa
     assert set(versions(tmp_path / "one-writer")).isdisjoint(versions(tmp_path / "two-writer"))
 
 
+def test_what_counts_from_one_again_after_a_kill_begins_a_new_epoch(start, module, launch_file, tmp_path):
+    """The only producer of the node: nothing of the node exports anything while it is away."""
+    ticker = TICKER.replace("config: {{", "config: {{counts: true, ")
+    assert ticker != TICKER
+    node = start(
+        "launch",
+        launch_file(
+            source={"modules": [module(ticker, "ticker", topic="ticks", period=10)], "back_off": {"first_s": 0.05}},
+            sink=[module(DOUBLER, "doubler", sent="ticks", topic="doubled", journal=tmp_path / "journal")],
+        ),
+    ).up()
+    node.wait_until(lambda: len(versions(tmp_path / "journal")) > 100)
+    os.kill(node.process("source")["pid"], signal.SIGKILL)
+    node.wait_until(lambda: min(versions(tmp_path / "journal")[60:]) < 60)  # it has not waited for what comes after 100
+    assert node.process("sink")["losses"].get("doubled", {}) == {}
+    assert node.stop() == 0
+
+
 def test_processes_of_a_node_share_one_endpoint_for_other_hosts(start, module, launch_file, tmp_path):
     """Both topics reach a node that knows that endpoint alone, also after whoever listens there was killed."""
     pytest.importorskip("zenoh")

@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import psutil
@@ -24,7 +25,7 @@ CHILD = Path(__file__).parent / "parts" / "tiny_child.py"
 class Run:
     """A node that ran from its start to its end."""
 
-    def __init__(self, folder, behaviours, links=None, reap=lambda node: [], **keys):
+    def __init__(self, folder, behaviours, links=None, reap=lambda node, orders: [], **keys):
         path = folder / "node.launch.yaml"
         processes = [
             {"name": name, "modules": ["m"], "back_off": {"first_s": 0.01}, **keys.get(name, {})} for name in behaviours
@@ -226,8 +227,8 @@ def test_a_signal_after_the_end_does_what_it_did_before(run):
 def test_what_dead_processes_left_is_removed_before_and_after_and_between(run):
     calls = []
 
-    def reap(node):
-        calls.append(node)
+    def reap(node, orders):
+        calls.append((node, orders))
         return ["left"] if len(calls) == 1 else []
 
     def scenario(node):
@@ -236,7 +237,8 @@ def test_what_dead_processes_left_is_removed_before_and_after_and_between(run):
         node.wait_for("state", 2, state="running")
 
     one = run({"a": "good"}, reap=reap).through(scenario)
-    assert calls == ["node"] * 3
+    # What says how far a producer was stays, while the node does, for when it comes back.
+    assert calls == [("node", True), ("node", False), ("node", True)]
     assert one.find("reaped")[0]["removed"] == ["left"]
 
 
@@ -321,6 +323,46 @@ def test_a_supervision_that_fails_itself_ends_the_node(run, monkeypatch):
     code = one.through().code
     assert code == 1
     assert "its supervision failed: RuntimeError: our own mistake" in one.find("ended")[0]["reason"]
+
+
+def test_what_cannot_be_shown_does_not_stop_the_supervision(run):
+    def fails(event):
+        raise ValueError("closing tag does not match")
+
+    def scenario(node):
+        node.wait_for("up")
+        shown, node.supervisor._on_event = node.supervisor._on_event, fails
+        os.kill(node.ask("ps")["processes"][0]["pid"], signal.SIGKILL)
+        while (again := node.ask("ps")["processes"][0])["restarts"] == 0 or again["state"] != "running":
+            time.sleep(0.01)
+        node.supervisor._on_event = shown
+
+    assert run({"a": "good"}).through(scenario).code == 0
+
+
+@pytest.mark.parametrize("handler", ["respawn", "exit", "ignore"])
+def test_a_restart_that_is_asked_for_is_one_whatever_is_said_of_deaths(run, handler):
+    def scenario(node):
+        node.wait_for("up")
+        for number in range(1, 4):
+            node.ask("restart", process="a")
+            node.wait_for("state", number + 1, process="a", state="running")
+            if number == 1:
+                assert not node.find("state", state="back off")
+        process = node.ask("ps")["processes"][0]
+        assert (process["deaths"], process["restarts"]) == ({"restarted": 3}, 3)
+
+    keys = {"exception_handler": handler, "restarts": {"limit": 1}}
+    assert run({"a": "good"}, a=keys).through(scenario).code == 0
+
+
+def test_what_does_not_run_cannot_be_restarted(run):
+    def scenario(node):
+        node.wait_for("state", process="a", state="building")
+        with pytest.raises(WarploomError, match="process 'a' is not running: it is building"):
+            node.ask("restart", process="a")
+
+    run({"a": "never ready"}).through(scenario)
 
 
 def test_a_plan_that_was_tidied_away_is_there_again_for_the_next_life(run):

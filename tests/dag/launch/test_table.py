@@ -138,6 +138,29 @@ def test_the_live_table_shows_processes_and_the_last_events():
     assert "| oops" in out.getvalue()
 
 
+def test_brackets_are_shown_as_they_are(monkeypatch):
+    """They are no markup: `[/dev/video0]` would be an error, and `[m]` would vanish."""
+    out = io.StringIO()
+    monkeypatch.setattr("sys.stdout", out)
+    table = LiveTable()
+    death = "RuntimeError: camera [/dev/video0] does not answer within 3 [m] :warning:"
+    table.show(lambda: {**STATUS, "processes": [{**STATUS["processes"][0], "last_death": death}]})
+    table.refresh()
+    table.close()
+    shown = "".join(out.getvalue().split())
+    assert "[/dev/video0]" in shown
+    assert "[m]:warning:" in shown
+
+
+def test_a_node_of_which_no_process_is_known_yet_is_shown():
+    out = io.StringIO()
+    table = LiveTable(Console(file=out, width=80))
+    table.show(lambda: {**STATUS, "processes": []})
+    table({"event": "reaped", "time": 0, "removed": ["x.socket"]})
+    table.close()
+    assert "x.socket" in out.getvalue()
+
+
 def test_a_reader_that_is_gone_does_not_break_the_supervisor():
     out = io.StringIO()
     lines = JsonLines(out)

@@ -1,5 +1,6 @@
 """Where the links of a node meet, and what dead processes leave there."""
 
+import errno
 import os
 import signal
 import socket
@@ -128,6 +129,7 @@ def test_reaping_takes_what_the_dead_left_and_names_it(node, listening):
     assert reap(node) == [str(links / "dead.socket")], "the orders are needed while others of the node live"
     assert exported_topics(node) == ["alive"]
     unlisten(node, "alive")
+    assert reap(node, orders=False) == [], "one that is away is to come back"
     assert reap(node) == [str(links / "dead.order")]
     assert list(links.iterdir()) == []
     assert reap(node) == []
@@ -270,6 +272,17 @@ class TestOrder:
         assert file.settled(0, 11) == 0
         assert file.epoch(0, 12) == 0
         assert file.settled(0, 3) == 0
+
+    def test_without_room_on_the_disk_the_life_goes_on_and_is_forgotten(self, node, monkeypatch, caplog):
+        def full(fd, offset, size):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        with monkeypatch.context() as disk:
+            disk.setattr(os, "posix_fallocate", full)
+            assert self.life(node, (0, 10), (0, 20)) == [0, 0]
+        assert "No space left on device; the order of 'topic' is forgotten" in caplog.text
+        assert self.life(node, (0, 10)) == [0]
+        assert self.life(node, (0, 10)) == [1]
 
     def test_a_file_that_is_damaged_counts_as_none(self, node):
         self.life(node, (5, 10))

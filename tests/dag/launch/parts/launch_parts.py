@@ -16,6 +16,7 @@ class TickerConfig(ProcessorConfig):
     size: int = 16
     hang_after: int = 0
     journal: str = ""
+    counts: bool = False  # versions count from 1 in each life, and are no times
 
 
 class Ticker(DataProcessComponent):
@@ -33,7 +34,7 @@ class Ticker(DataProcessComponent):
         if self._config.hang_after and self._count > self._config.hang_after:
             threading.Event().wait()
         with self.out.allocate_change() as change:
-            change.set_version(trigger.version)
+            change.set_version(self._count if self._config.counts else trigger.version)
             change.value = np.full(self._config.size, self._count, np.int64)
             self.out.commit(CommitPolicy.DISCARD_OUT_OF_ORDER, change)
         if self._config.journal:
