@@ -1,11 +1,14 @@
 """The command `warploom` as such: its help, and what holds for every command."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["app"]
+__all__ = ["app", "ends_in_order"]
 
 app = typer.Typer(
     name="warploom",
@@ -14,6 +17,34 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
+
+
+class _Ended(KeyboardInterrupt):
+    pass
+
+
+@contextmanager
+def ends_in_order() -> Iterator[None]:
+    """Lets SIGTERM and SIGHUP end a command as Ctrl-C does, so that what it writes is finished.
+
+    A service manager sends them, or a terminal that closes. One that is ignored stays so.
+    """
+
+    def end(number: int, _: object) -> None:
+        raise _Ended(number)
+
+    before = {one: signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)}
+    ours = [one for one, handler in before.items() if handler is signal.SIG_DFL]
+    for one in ours:
+        signal.signal(one, end)
+    try:
+        yield
+    except _Ended as ended:
+        typer.echo(f"warploom: ended by {signal.Signals(ended.args[0]).name}", err=True)
+        raise typer.Exit(128 + ended.args[0]) from None
+    finally:
+        for one in ours:
+            signal.signal(one, signal.SIG_DFL)
 
 
 @app.callback()

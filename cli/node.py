@@ -164,7 +164,9 @@ def _launch(planned: Launch, start: Start) -> None:
         return
     level = _level()
     if start.as_json or not sys.stdout.isatty():
-        raise typer.Exit(run_launch(planned, on_event=JsonLines(), log_level=level))
+        with contextlib.closing(JsonLines()) as lines:
+            code = run_launch(planned, on_event=lines, log_level=level)
+        raise typer.Exit(code)
     table = LiveTable()
     try:
         code = run_launch(planned, on_event=table, log_level=level, table=table)

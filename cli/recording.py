@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from .application import ends_in_order
 from .options import Device, Profile, Settings
 
 if TYPE_CHECKING:
@@ -42,20 +43,23 @@ def record(
 
     if compression not in ("lz4", "zstd", "none"):
         raise typer.BadParameter(f"{compression!r} is none of lz4, zstd, none", param_hint="--compression")
-    summary = record_source(
-        source,
-        out,
-        profile=profile,
-        device=device,
-        settings=settings or (),
-        frames=frames,
-        realtime=realtime,
-        topics=topics or (),
-        digest_only=digest_only or (),
-        compression=compression,
-    )
+    with ends_in_order():
+        summary = record_source(
+            source,
+            out,
+            profile=profile,
+            device=device,
+            settings=settings or (),
+            frames=frames,
+            realtime=realtime,
+            topics=topics or (),
+            digest_only=digest_only or (),
+            compression=compression,
+        )
     for line in summary.lines():
         typer.echo(line)
+    if summary.failure is not None:
+        raise typer.Exit(1)
 
 
 @commands.command()
@@ -80,18 +84,19 @@ def play(
 
     if rate is not None and rate <= 0:
         raise typer.BadParameter(f"{rate} is not above 0", param_hint="--rate")
-    summary = play_recording(
-        file,
-        profile=profile,
-        device=device,
-        settings=settings or (),
-        topics=topics or (),
-        rate=None if fast or step else rate,
-        seek=seek,
-        loops=loop or None,
-        record=record,
-        on_event=_teller(step),
-    )
+    with ends_in_order():
+        summary = play_recording(
+            file,
+            profile=profile,
+            device=device,
+            settings=settings or (),
+            topics=topics or (),
+            rate=None if fast or step else rate,
+            seek=seek,
+            loops=loop or None,
+            record=record,
+            on_event=_teller(step),
+        )
     counts = ", ".join(f"{count} of {topic}" for topic, count in summary.published.items()) or "nothing"
     typer.echo(f"played {counts} in {summary.seconds:.2f} s")
     for topic, count in summary.skipped.items():
@@ -100,6 +105,8 @@ def play(
         typer.echo(f"{file}: {summary.broken}; what comes before was played")
     for line in summary.recorded.lines() if summary.recorded else ():
         typer.echo(line)
+    if summary.recorded is not None and summary.recorded.failure is not None:
+        raise typer.Exit(1)
 
 
 def _teller(step: bool) -> Callable[[RecordedEvent], bool]:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from .application import ends_in_order
 from .options import Device, MetricsPort, Profile, Settings, TraceFile
 
 __all__ = ["commands"]
@@ -32,16 +33,17 @@ def demo(
     from ..components.running import run_to_folder
 
     source = f"sim:street?seed={seed}&duration={seconds}"
-    run_to_folder(
-        source,
-        profile=profile,
-        device=device,
-        settings=settings or (),
-        out=out,
-        picture=True,
-        trace=trace,
-        metrics_port=metrics_port,
-    )
+    with ends_in_order():
+        run_to_folder(
+            source,
+            profile=profile,
+            device=device,
+            settings=settings or (),
+            out=out,
+            picture=True,
+            trace=trace,
+            metrics_port=metrics_port,
+        )
 
 
 @commands.command()
@@ -72,15 +74,16 @@ def run(
     """
     from ..components.running import run_to_folder
 
-    run_to_folder(
-        source,
-        profile=profile,
-        device=device,
-        settings=[*(settings or ()), *(["profile.check=true"] if check else [])],
-        out=out,
-        frames=frames,
-        realtime=realtime,
-        mcap=mcap,
-        trace=trace,
-        metrics_port=metrics_port,
-    )
+    with ends_in_order():
+        run_to_folder(
+            source,
+            profile=profile,
+            device=device,
+            settings=[*(settings or ()), *(["profile.check=true"] if check else [])],
+            out=out,
+            frames=frames,
+            realtime=realtime,
+            mcap=mcap,
+            trace=trace,
+            metrics_port=metrics_port,
+        )

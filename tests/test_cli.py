@@ -4,8 +4,10 @@ import io
 import json
 import os
 import pathlib
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -257,3 +259,44 @@ def test_the_example_of_your_scans_runs(scans, tmp_path):
     command = [sys.executable, str(EXAMPLES / "your_scans.py"), str(tmp_path / "scan.npy")]
     output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "clusters" in output
+
+
+@pytest.mark.parametrize(
+    ("command", "number"), [("record", signal.SIGTERM), ("run", signal.SIGHUP), ("record", signal.SIGINT)]
+)
+def test_what_is_ended_by_a_signal_finishes_what_it_writes(warploom, tmp_path, command, number):
+    from warploom.datamesh.recording_reader import Recording
+
+    out = tmp_path / ("a.mcap" if command == "record" else "out")
+    file = out if command == "record" else out / "run.mcap"
+    one = subprocess.Popen(
+        [sys.executable, "-c", "from warploom.cli import main; main()", command, "--realtime",
+         "--source", "sim:street?duration=60", "--out", str(out)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 120
+        while not file.exists() or file.stat().st_size < 100_000:
+            assert one.poll() is None, one.communicate()
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        one.send_signal(number)
+        _, errors = one.communicate(timeout=60)
+    finally:
+        one.kill()
+    assert one.returncode == 128 + number, errors
+    assert "Traceback" not in errors
+    assert "messages: " in warploom("info", str(file))
+    if command == "record":
+        assert Recording(file).broken is None
+
+
+def test_a_recording_that_broke_off_is_a_command_that_failed(warploom, tmp_path, monkeypatch):
+    from warploom.components import recording
+
+    (tmp_path / "a.mcap").write_bytes(b"")
+    summary = recording.RecordSummary(tmp_path / "a.mcap", 5, failure="No space left on device")
+    monkeypatch.setattr(recording, "record_source", lambda *_, **__: summary)
+    output = warploom("record", "--source", "sim:street", "--out", "a.mcap", expect=1)
+    assert "the recording broke off: No space left on device" in output

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import sys
+import logging
+import os
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -15,7 +18,12 @@ if TYPE_CHECKING:
 
 __all__ = ["JsonLines", "LiveTable", "component_table", "process_table", "topic_table", "usage_view"]
 
+_log = logging.getLogger(__name__)
+
 _SHOWN_EVENTS = 8
+_EVENTS_WAITING = 10_000
+_PATIENCE_S = 2.0
+"""How long a reader may take at the end."""
 _QUIET = ("state",)
 _COLUMNS = ("process", "state", "pid", "up", "restarts", "cpu %", "memory", "fds")
 _LEFT_OUT_FIRST = ("fds", "memory", "up", "restarts", "pid")
@@ -23,20 +31,77 @@ _SAYS_WIDTH = 24
 """Characters that the last column of the processes is to have."""
 
 
+class _Aside:
+    """Does what may block in a thread of its own, in order: who stops reading must not stop who supervises."""
+
+    def __init__(self, do: Callable[[Any], None]) -> None:
+        self.lost = 0
+        """What there was no room for."""
+        self._do = do
+        self._waiting: deque[Any] = deque()
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="shown", daemon=True)
+        self._thread.start()
+
+    def __call__(self, what: Any, most: int) -> None:
+        """Hands something over, unless so many wait already: then the oldest of them is lost."""
+        with self._changed:
+            while len(self._waiting) >= most:
+                self._waiting.popleft()
+                self.lost += 1
+            self._waiting.append(what)
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._closing)
+                if not self._waiting:
+                    return
+                what = self._waiting.popleft()
+            try:
+                self._do(what)
+            except Exception:
+                _log.exception("what happens cannot be shown")
+
+    def close(self) -> None:
+        """Waits until all is done, but not for long."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(_PATIENCE_S)
+
+
 class JsonLines:
     """Writes every event as a line of JSON."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        """Names the stream; by default stdout."""
-        self._stream = sys.stdout if stream is None else stream
+        """Names the stream; by default stdout, which is written to past its buffer, for that is flushed at exit."""
+        self._stream = stream
+        self._told_lost = 0
+        self._aside = _Aside(self._write)
 
     def __call__(self, event: Mapping[str, Any]) -> None:
-        """Writes one; a reader that has gone away is no reason to stop."""
-        try:
-            self._stream.write(json.dumps(event, default=str) + "\n")
-            self._stream.flush()
-        except (OSError, ValueError):
-            pass
+        """Writes one, soon; where the reader is far behind, the oldest are lost, and that is told."""
+        self._aside(json.dumps(event, default=str) + "\n", _EVENTS_WAITING)
+
+    def _write(self, line: str) -> None:
+        if (lost := self._aside.lost) > self._told_lost:
+            line = json.dumps({"event": "lost", "events": lost - self._told_lost}) + "\n" + line
+            self._told_lost = lost
+        with contextlib.suppress(OSError, ValueError):  # a reader that has gone away is no reason to stop
+            if self._stream is not None:
+                self._stream.write(line)
+                self._stream.flush()
+                return
+            data = line.encode()
+            while data:
+                data = data[os.write(1, data) :]
+
+    def close(self) -> None:
+        """Lets what waits be written, if it is read."""
+        self._aside.close()
 
 
 class LiveTable:
@@ -53,17 +118,31 @@ class LiveTable:
 
         self._status: Callable[[], Mapping[str, Any]] | None = None
         self._events: list[Mapping[str, Any]] = []
-        self._live = Live(console=console or Console(markup=False, emoji=False), auto_refresh=False, transient=False)
+        if console is None:
+            # Not through stdout, which is flushed at exit, and would wait for a terminal that is held (Ctrl-S).
+            terminal = open(os.dup(1), "w", encoding="utf-8")  # noqa: SIM115 (it is open to the end)
+            console = Console(file=terminal, markup=False, emoji=False)
+        self._live = Live(console=console, auto_refresh=False, transient=False)
+        self._aside: _Aside | None = None
 
     def show(self, status: Callable[[], Mapping[str, Any]]) -> None:
         """Begins to show a node, whose status the function gives as `ps` is answered."""
         self._status = status
         self._live.start()
+        self._aside = _Aside(self._draw)
+
+    def _draw(self, picture: Group | None) -> None:
+        with contextlib.suppress(OSError):  # the terminal has gone
+            if picture is None:
+                self._live.stop()
+            else:
+                self._live.update(picture, refresh=True)
 
     def close(self) -> None:
         """Leaves the last picture on the terminal."""
-        with contextlib.suppress(OSError):  # the terminal has gone
-            self._live.stop()
+        if self._aside is not None:
+            self._aside(None, 2)
+            self._aside.close()
 
     def __call__(self, event: Mapping[str, Any]) -> None:
         """Takes up an event."""
@@ -72,15 +151,15 @@ class LiveTable:
         self.refresh()
 
     def refresh(self) -> None:
-        """Draws once."""
-        if self._status is None:
+        """Draws once, soon; where drawing is slow, the newest picture alone."""
+        if self._status is None or self._aside is None:
             return
         from rich.console import Group
         from rich.text import Text
 
         lines = [Text(event_text(event), style=_style(event)) for event in self._events]
         table = process_table(self._status(), width=self._live.console.width)
-        self._live.update(Group(table, *lines), refresh=True)
+        self._aside(Group(table, *lines), 1)
 
 
 def event_text(event: Mapping[str, Any]) -> str:

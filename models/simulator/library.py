@@ -140,12 +140,10 @@ def _surface(shape: Shape) -> np.ndarray:
 class Library:
     """Prototypes as meshes on a device, and a place for the ground of each present scene."""
 
-    max_ground_faces = 40_000
-    """Triangles that a ground may have."""
-
-    def __init__(self, device: str = "cpu", grounds: int = 1):
-        self.meshes = MeshSet(device, max_faces=(1 << 21) + grounds * self.max_ground_faces)
-        self.grounds = [self.meshes.reserve(self.max_ground_faces) for _ in range(grounds)]
+    def __init__(self, device: str = "cpu", grounds: int = 1, ground_faces: int = 40_000):
+        """Reserves places for so many grounds of up to so many triangles each."""
+        self.meshes = MeshSet(device, max_faces=(1 << 21) + grounds * ground_faces)
+        self.grounds = [self.meshes.reserve(ground_faces) for _ in range(grounds)]
         self._numbers: dict[tuple[str, int, int], int] = {}
 
     def number(self, kind: str, variant: int, phase: int = 0) -> int:

@@ -23,6 +23,8 @@ from .world import World
 
 __all__ = ["Simulator"]
 
+_LONGEST = 3600.0  # [s] of a drive
+
 
 class Simulator:
     """A drive along a simulated street; iterating gives its frames, the same ones each time."""
@@ -60,7 +62,8 @@ class Simulator:
 
         Raises:
             TypeError: A number that is none.
-            ValueError: No such scenario or sensor, a seed, rain or polish below 0, or another number not above it.
+            ValueError: No such scenario or sensor, a seed, rain or polish below 0, or another number not above it; or a
+                drive longer than an hour.
             DeviceError: No such device.
         """
         check_whole(seed, "seed", 0)
@@ -72,15 +75,20 @@ class Simulator:
             "polish": polish,
         }
         check_numbers(numbers, above_0=("duration", "rate", "mounting_height"), from_0=("rain", "polish"))
+        if duration > _LONGEST:
+            raise ValueError(
+                f"duration must be {_LONGEST:g} s at most, not {duration:g}: a drive lies ready as a whole"
+            )
         self.seed, self.rate, self.duration, self.rain = seed, rate, duration, rain
         self.mounting_height, self.turning, self.visibility = mounting_height, turning, visibility
         self.lidar = lidar if isinstance(lidar, Lidar) else lidar_model(lidar)
         drive = build_drive(scenario, seed, duration)
         self.polish = polish
         self._ego = EgoPath(drive.street.ground, drive.lane, np.array(drive.motion), duration)
-        library = Library(resolve_device(device))
+        library = Library(resolve_device(device), ground_faces=len(drive.street.ground.mesh()[1]))
         self._world = World(drive.street, library)
-        self._cast = caster(library, self.lidar, 1.0 / rate, wetness=1.0 if rain > 0 else 0.0)
+        wetness = 1.0 if rain > 0 else 0.0
+        self._cast = caster(library, self.lidar, 1.0 / rate, wetness=wetness, things=1 + len(self._world))
         self._cast.set_rain(rain)
         self._mounting = mounting(mounting_height, 0.0, 0.0)
         self._views: dict[Camera, CameraView] = {}

@@ -25,8 +25,10 @@ _NO_MATERIAL = 255
 _INSTANT = 1e-3  # [s] before and after a time, of the differences that stand for a velocity
 
 
-def caster(library: Library, lidar: Lidar, period: float, *, worlds: int = 1, wetness: float = 0.0) -> LidarCast:
-    """The plan that casts the beams of a sensor."""
+def caster(
+    library: Library, lidar: Lidar, period: float, *, worlds: int = 1, wetness: float = 0.0, things: int = 4096
+) -> LidarCast:
+    """The plan that casts the beams of a sensor into worlds of up to so many things each, the ground among them."""
     beams, ring, fraction = lidar.beams
     cast = LidarCast(
         meshes=library.meshes,
@@ -35,6 +37,7 @@ def caster(library: Library, lidar: Lidar, period: float, *, worlds: int = 1, we
         time=fraction * period,
         period=period,
         worlds=worlds,
+        max_instances=things,
         min_range=lidar.min_range,
         max_range=lidar.max_range,
         reach=lidar.reach,

@@ -2,6 +2,7 @@
 
 import io
 import json
+import threading
 
 import pytest
 from rich.console import Console
@@ -116,7 +117,9 @@ def test_an_event_is_a_line_to_read_or_of_json():
     event = {"event": "died", "process": "p", "time": 0, "node": "n", "reason": "was ended", "last_lines": ["oops"]}
     assert "p died: reason was ended\n           | oops" in event_text(event)
     out = io.StringIO()
-    JsonLines(out)(event)
+    lines = JsonLines(out)
+    lines(event)
+    lines.close()
     assert json.loads(out.getvalue()) == event
 
 
@@ -126,28 +129,26 @@ def test_the_live_table_shows_processes_and_the_last_events():
     table({"event": "launching", "time": 0})  # before there is anything to show
     assert out.getvalue() == ""
     table.show(lambda: STATUS)
-    table({"event": "died", "process": "compute", "time": 0, "reason": "was ended by SIGKILL", "last_lines": ["oops"]})
     for number in range(20):
         table({"event": "warning", "process": "compute", "time": 0, "message": f"warning {number}"})
+    table({"event": "died", "process": "compute", "time": 0, "reason": "was ended by SIGKILL", "last_lines": ["oops"]})
     table.refresh()
     table.close()
     last = out.getvalue().rsplit("node two", 1)[1]
     assert "compute" in last
     assert "warning 19" in last
-    assert "warning 11" not in last
-    assert "| oops" in out.getvalue()
+    assert "warning 12" not in last
+    assert "| oops" in last
 
 
-def test_brackets_are_shown_as_they_are(monkeypatch):
+def test_brackets_are_shown_as_they_are(capfd):
     """They are no markup: `[/dev/video0]` would be an error, and `[m]` would vanish."""
-    out = io.StringIO()
-    monkeypatch.setattr("sys.stdout", out)
     table = LiveTable()
     death = "RuntimeError: camera [/dev/video0] does not answer within 3 [m] :warning:"
     table.show(lambda: {**STATUS, "processes": [{**STATUS["processes"][0], "last_death": death}]})
     table.refresh()
     table.close()
-    shown = "".join(out.getvalue().split())
+    shown = "".join(capfd.readouterr().out.split())
     assert "[/dev/video0]" in shown
     assert "[m]:warning:" in shown
 
@@ -166,3 +167,45 @@ def test_a_reader_that_is_gone_does_not_break_the_supervisor():
     lines = JsonLines(out)
     out.close()
     lines({"event": "up"})
+    lines.close()
+
+
+class Stalls(io.StringIO):
+    """Takes nothing until it is let go on, as a terminal after Ctrl-S."""
+
+    def __init__(self):
+        super().__init__()
+        self.begun, self.go_on = threading.Event(), threading.Event()
+
+    def write(self, text):
+        self.begun.set()
+        assert self.go_on.wait(60)
+        return super().write(text)
+
+
+def test_a_reader_that_stalls_does_not_hold_up_the_supervisor_and_is_told_what_it_lost(monkeypatch):
+    monkeypatch.setattr("warploom.dag.launch.table._EVENTS_WAITING", 5)
+    out = Stalls()
+    lines = JsonLines(out)
+    lines({"event": "number", "number": 0})
+    assert out.begun.wait(60)
+    for number in range(1, 11):
+        lines({"event": "number", "number": number})
+    out.go_on.set()
+    lines.close()
+    told = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [one["number"] for one in told if one["event"] == "number"] == [0, 6, 7, 8, 9, 10]
+    assert told[1] == {"event": "lost", "events": 5}
+
+
+def test_a_terminal_that_is_held_does_not_hold_up_the_supervisor(monkeypatch):
+    monkeypatch.setattr("warploom.dag.launch.table._PATIENCE_S", 0.05)
+    out = Stalls()
+    out.go_on.set()
+    table = LiveTable(Console(file=out, width=80, force_terminal=True))
+    table.show(lambda: STATUS)
+    out.go_on.clear()
+    for number in range(100):
+        table({"event": "warning", "time": 0, "message": f"warning {number}"})
+    table.close()
+    out.go_on.set()

@@ -201,3 +201,18 @@ def test_what_a_drive_cannot_give_is_named(drive):
 def test_a_frame_that_is_not_there(drive):
     with pytest.raises(IndexError, match="0 to 19"):
         drive.frame(20)
+
+
+def test_a_drive_may_be_minutes_long():
+    """Far more ground and things than in a usual one, and still a street at its end."""
+    long = Simulator(seed=3, lidar="vlp16", duration=400.0)
+    assert len(long.ground.mesh()[1]) > 100_000
+    last = long.frame(len(long) - 1)
+    assert len(last.points) > 10_000
+    assert last.ground.mean() > 0.1
+    assert (last.counts > 10).any()
+
+
+def test_a_drive_that_is_too_long_is_refused():
+    with pytest.raises(ValueError, match="duration must be 3600 s at most, not 3601"):
+        Simulator(duration=3601.0)
